@@ -1,0 +1,98 @@
+"""Pinhole camera with lens distortion.
+
+Pixels follow OpenCV and sensor_msgs/CameraInfo: the centre of the top-left pixel is (0, 0).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import cv2
+import numpy as np
+
+# OpenCV's models behind the names that sensor_msgs/CameraInfo gives them, with the numbers of coefficients they take.
+_COEFFICIENTS = {"plumb_bob": (0, 4, 5), "rational_polynomial": (0, 8, 12, 14), "equidistant": (0, 4)}
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """Intrinsics of a camera.
+
+    Attributes:
+        width, height: image size in pixels.
+        K: (3, 3) float64 intrinsic matrix in pixels.
+        distortion: (n,) float64 coefficients in OpenCV's order for `model`; empty or all zero means none.
+        model: "plumb_bob", "rational_polynomial" or "equidistant" (fisheye), as in sensor_msgs/CameraInfo.
+
+    Raises:
+        ValueError: a size or focal length that is not positive, a value that is not finite, a K that is not
+            upper triangular, an unknown model or a wrong number of coefficients for it.
+    """
+
+    width: int
+    height: int
+    K: np.ndarray
+    distortion: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    model: str = "plumb_bob"
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "K", np.asarray(self.K, dtype=np.float64).reshape(3, 3))
+        object.__setattr__(self, "distortion", np.asarray(self.distortion, dtype=np.float64).ravel())
+        if self.width <= 0 or self.height <= 0:
+            raise ValueError(f"camera size {self.width}x{self.height} must be positive")
+        if not (np.isfinite(self.K).all() and np.isfinite(self.distortion).all()):
+            raise ValueError("camera K and distortion must be finite")
+        if self.K[0, 0] <= 0 or self.K[1, 1] <= 0:
+            raise ValueError(
+                f"focal lengths {self.K[0, 0]:g} and {self.K[1, 1]:g} must be positive: calibrate the camera"
+            )
+        if not np.array_equal(self.K[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1]):
+            raise ValueError(f"camera K must be upper triangular and end with 1, got {self.K.tolist()}")
+        if self.model not in _COEFFICIENTS:
+            raise ValueError(f"distortion model {self.model!r} is not one of {', '.join(_COEFFICIENTS)}")
+        counts = _COEFFICIENTS[self.model]
+        if len(self.distortion) not in counts:
+            raise ValueError(f"distortion model {self.model} takes {counts} coefficients, got {len(self.distortion)}")
+
+    @property
+    def fov_x(self) -> float:
+        """Horizontal field of view of the undistorted image, in radians."""
+        return 2.0 * float(np.arctan(0.5 * self.width / self.K[0, 0]))
+
+    def scaled(self, width: int, height: int) -> Camera:
+        """Return the camera of the same image resized to `width` x `height` pixels.
+
+        Resizing keeps the corners of the image, half a pixel outside the centres of the corner pixels.
+        """
+        scale = np.diag([width / self.width, height / self.height, 1.0])
+        half = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
+        return replace(self, width=width, height=height, K=np.linalg.inv(half) @ scale @ half @ self.K)
+
+    def limited(self, max_width: int) -> Camera:
+        """Return the camera of the image resized, in proportion, to at most `max_width` pixels of width."""
+        if self.width <= max_width:
+            return self
+        return self.scaled(max_width, max(1, round(self.height * max_width / self.width)))
+
+    def undistort(self, pixels: np.ndarray) -> np.ndarray:
+        """Move observed pixels (N, 2) to where a pinhole camera with the same K would see them: (N, 2) float64."""
+        pixels = np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
+        if len(pixels) == 0 or not self.distortion.any():
+            return pixels.copy()
+        points = pixels.reshape(-1, 1, 2)
+        if self.model == "equidistant":
+            undistorted = cv2.fisheye.undistortPoints(points, self.K, self.distortion, P=self.K)
+        else:
+            criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-10)
+            undistorted = cv2.undistortPointsIter(points, self.K, self.distortion, None, self.K, criteria)
+        return undistorted.reshape(-1, 2)
+
+    def project(self, points: np.ndarray) -> np.ndarray:
+        """Pinhole pixels (N, 2), without distortion, of camera-frame points (N, 3) with z > 0."""
+        homogeneous = points @ self.K.T
+        return homogeneous[:, :2] / homogeneous[:, 2:]
+
+    def rays(self, pixels: np.ndarray) -> np.ndarray:
+        """Camera-frame directions (N, 3) with z = 1 through undistorted pixels (N, 2)."""
+        homogeneous = np.column_stack([pixels, np.ones(len(pixels))])
+        return homogeneous @ np.linalg.inv(self.K).T

@@ -1,0 +1,116 @@
+"""Rigid-body geometry: SE(3), quaternions, perturbations and pose errors.
+
+A pose ``T_a_b`` is a 4x4 float64 matrix that maps points of frame b into frame a. Quaternions are xyzw, as in ROS.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+# Below this angle (radians) the closed forms divide nearly 0 by nearly 0: use their series.
+_SMALL_ANGLE = 1e-6
+
+
+def make_pose(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
+    """Build a pose (4, 4) from a rotation matrix (3, 3) and a translation (3,)."""
+    pose = np.eye(4)
+    pose[:3, :3] = rotation
+    pose[:3, 3] = translation
+    return pose
+
+
+def invert(pose: np.ndarray) -> np.ndarray:
+    """Invert a rigid pose (4, 4): ``invert(T_a_b)`` is ``T_b_a``."""
+    rotation = pose[:3, :3].T
+    return make_pose(rotation, -rotation @ pose[:3, 3])
+
+
+def transform(pose: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Map points (N, 3) of frame b into frame a by ``T_a_b`` (4, 4)."""
+    return points @ pose[:3, :3].T + pose[:3, 3]
+
+
+def skew(vector: np.ndarray) -> np.ndarray:
+    """Cross-product matrices (..., 3, 3) of vectors (..., 3): ``skew(a) @ b == cross(a, b)``."""
+    x, y, z = np.moveaxis(np.asarray(vector, dtype=np.float64), -1, 0)
+    zero = np.zeros_like(x)
+    rows = [[zero, -z, y], [z, zero, -x], [-y, x, zero]]
+    return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
+
+
+def so3_exp(rotation_vector: np.ndarray) -> np.ndarray:
+    """Rotation matrix (3, 3) of a rotation vector (3,) in radians (Rodrigues' formula)."""
+    angle = np.linalg.norm(rotation_vector)
+    cross = skew(rotation_vector)
+    if angle < _SMALL_ANGLE:
+        return np.eye(3) + cross + 0.5 * cross @ cross
+    return np.eye(3) + np.sin(angle) / angle * cross + (1 - np.cos(angle)) / angle**2 * cross @ cross
+
+
+def so3_log(rotation: np.ndarray) -> np.ndarray:
+    """Rotation vector (3,) in radians, of norm at most pi, of a rotation matrix (3, 3)."""
+    x, y, z, w = quaternion_from_matrix(rotation)
+    sine = np.sqrt(x * x + y * y + z * z)
+    scale = 2.0 / w if sine < _SMALL_ANGLE else 2.0 * np.arctan2(sine, w) / sine
+    return scale * np.array([x, y, z])
+
+
+def matrix_from_quaternion(quaternion: np.ndarray) -> np.ndarray:
+    """Rotation matrix (3, 3) of a quaternion (4,) xyzw of any positive norm.
+
+    Raises:
+        ValueError: the quaternion is not finite or its norm is (nearly) zero.
+    """
+    quaternion = np.asarray(quaternion, dtype=np.float64)
+    norm = np.linalg.norm(quaternion)
+    if not np.isfinite(norm) or norm < 1e-9:
+        raise ValueError(f"quaternion {quaternion.tolist()} has no direction: it must be finite and not zero")
+    x, y, z, w = quaternion / norm
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def quaternion_from_matrix(rotation: np.ndarray) -> np.ndarray:
+    """Unit quaternion (4,) xyzw with w >= 0 of a rotation matrix (3, 3) (Shepperd's method, 1978)."""
+    m = rotation
+    # Four times the squared components; the largest is the safe one to divide by.
+    squares = np.array(
+        [
+            1 + m[0, 0] - m[1, 1] - m[2, 2],
+            1 - m[0, 0] + m[1, 1] - m[2, 2],
+            1 - m[0, 0] - m[1, 1] + m[2, 2],
+            1 + m[0, 0] + m[1, 1] + m[2, 2],
+        ]
+    )
+    largest = int(np.argmax(squares))
+    if largest == 0:
+        q = np.array([squares[0], m[0, 1] + m[1, 0], m[0, 2] + m[2, 0], m[2, 1] - m[1, 2]])
+    elif largest == 1:
+        q = np.array([m[0, 1] + m[1, 0], squares[1], m[1, 2] + m[2, 1], m[0, 2] - m[2, 0]])
+    elif largest == 2:
+        q = np.array([m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], squares[2], m[1, 0] - m[0, 1]])
+    else:
+        q = np.array([m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1], squares[3]])
+    q /= np.linalg.norm(q)
+    return -q if q[3] < 0 else q
+
+
+def random_unit_vector(rng: np.random.Generator) -> np.ndarray:
+    """Direction (3,) uniform on the sphere."""
+    vector = rng.normal(size=3)
+    return vector / np.linalg.norm(vector)
+
+
+def rotation_error_deg(pose_a: np.ndarray, pose_b: np.ndarray) -> float:
+    """Angle in degrees between the rotations of two poses (4, 4)."""
+    return float(np.degrees(np.linalg.norm(so3_log(pose_a[:3, :3].T @ pose_b[:3, :3]))))
+
+
+def translation_error(pose_a: np.ndarray, pose_b: np.ndarray) -> float:
+    """Distance between the origins of two poses (4, 4), in the units of their frame."""
+    return float(np.linalg.norm(pose_a[:3, 3] - pose_b[:3, 3]))

@@ -1,0 +1,42 @@
+"""A 3D Gaussian Splatting map in memory."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+# Numbers of spherical-harmonics coefficients per colour channel for degrees 0 to 3.
+SH_COEFFICIENTS = (1, 4, 9, 16)
+
+
+class MapError(ValueError):
+    """A map file cannot be used; the message names the file, what is wrong and what to do."""
+
+
+@dataclass(frozen=True, eq=False)
+class GaussianMap:
+    """Gaussians with their parameters activated, ready to be drawn.
+
+    Attributes:
+        means: (N, 3) float32 centres.
+        scales: (N, 3) float32 standard deviations along the axes, > 0.
+        rotations: (N, 4) float32 unit quaternions wxyz that turn the Gaussian's axes into the map's.
+        opacities: (N,) float32 in [0, 1].
+        sh: (N, C, 3) float32 spherical harmonics of the colour, C = 1, 4, 9 or 16 for degree 0 to 3, in the order of
+            the INRIA rasterizer; colour = 0.5 + the harmonics' sum in the direction from the camera, cut at 0.
+    """
+
+    means: np.ndarray
+    scales: np.ndarray
+    rotations: np.ndarray
+    opacities: np.ndarray
+    sh: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    @property
+    def sh_degree(self) -> int:
+        """Degree of the spherical harmonics, 0 to 3."""
+        return SH_COEFFICIENTS.index(self.sh.shape[1])

@@ -1,0 +1,50 @@
+"""What every renderer takes and returns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from gsfeatloc_ros.camera import Camera
+
+# Conventions of gsplat and of the INRIA rasterizer: a Gaussian is blurred by 0.3 square pixels, contributes where its
+# alpha is at least 1/255, its alpha is cut at 0.999, and a ray ends before its transmittance falls to 1e-4.
+EPS2D = 0.3
+MIN_ALPHA = 1.0 / 255.0
+MAX_ALPHA = 0.999
+MIN_TRANSMITTANCE = 1e-4
+# Gaussians nearer than this (splat units) are not drawn, as in gsplat.
+NEAR_PLANE = 0.01
+# Depth is given where the splats cover at least this much of the pixel.
+DEPTH_MIN_ALPHA = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Render:
+    """What a camera at one pose would see of the map, on a black background.
+
+    Attributes:
+        rgb: (H, W, 3) float32 in [0, 1].
+        depth: (H, W) float32, alpha-weighted mean z-depth in map units; NaN where alpha < DEPTH_MIN_ALPHA.
+        depth_std: (H, W) float32, spread of the depths that made the pixel, in map units; NaN where depth is.
+        alpha: (H, W) float32 in [0, 1], how much of the pixel the splats cover.
+    """
+
+    rgb: np.ndarray
+    depth: np.ndarray
+    depth_std: np.ndarray
+    alpha: np.ndarray
+
+    def image(self) -> np.ndarray:
+        """Colours as an 8-bit RGB image (H, W, 3)."""
+        return np.rint(self.rgb * 255.0).astype(np.uint8)
+
+
+class Renderer(Protocol):
+    """Draws a map. Implementations are safe to call from any thread and release the GIL."""
+
+    def render(self, camera: Camera, T_map_camera: np.ndarray) -> Render:
+        """Draw what `camera` (its distortion ignored) sees from the pose `T_map_camera` (4, 4)."""
+        ...
