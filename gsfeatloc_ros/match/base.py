@@ -43,6 +43,10 @@ class Matches:
     def __len__(self) -> int:
         return len(self.a)
 
+    def select(self, kept: np.ndarray) -> Matches:
+        """The matches that a mask (M,) or indices name."""
+        return Matches(self.a[kept], self.b[kept], self.scores[kept])
+
     @staticmethod
     def from_indices(a: Features, b: Features, index_a: np.ndarray, index_b: np.ndarray, scores: np.ndarray) -> Matches:
         """Matches between the features `index_a` (M,) of `a` and `index_b` (M,) of `b`."""

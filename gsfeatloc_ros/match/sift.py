@@ -1,0 +1,37 @@
+"""SIFT (Lowe, 2004) by OpenCV, with the RootSIFT descriptor (Arandjelovic and Zisserman, 2012)."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from gsfeatloc_ros.match.base import Features, Matches
+from gsfeatloc_ros.match.nearest import match_mutual
+
+# Renders are smoother than photos: SIFT's usual threshold of 0.04 leaves too few features in them.
+_CONTRAST_THRESHOLD = 0.01
+_MAX_RATIO = 0.85
+
+
+class Sift:
+    """SIFT features, matched by mutual nearest neighbours and the ratio test. Needs no weights."""
+
+    def __init__(self, max_features: int) -> None:
+        # Precise upscaling: without it keypoints are a quarter of a pixel off.
+        self._sift = cv2.SIFT_create(
+            nfeatures=max_features, contrastThreshold=_CONTRAST_THRESHOLD, enable_precise_upscale=True
+        )
+
+    def features(self, image: np.ndarray) -> Features:
+        """Extract the features of an RGB image (H, W, 3) uint8."""
+        keypoints, descriptors = self._sift.detectAndCompute(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), None)
+        if not keypoints:
+            return Features(np.empty((0, 2), np.float32), np.empty((0, 128), np.float32), np.empty(0, np.float32))
+        descriptors = np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-9))
+        return Features(
+            cv2.KeyPoint.convert(keypoints), descriptors, np.array([k.response for k in keypoints], dtype=np.float32)
+        )
+
+    def match(self, a: Features, b: Features) -> Matches:
+        """Match the features of two images."""
+        return match_mutual(a, b, max_ratio=_MAX_RATIO)

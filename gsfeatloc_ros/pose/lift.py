@@ -1,0 +1,66 @@
+"""From matched pixels of a render to points of the map."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsfeatloc_ros.camera import Camera
+from gsfeatloc_ros.geometry import transform
+from gsfeatloc_ros.render.base import Render
+
+# A pixel is lifted where its four neighbours are covered by splats, lie on one surface, and the splats that made them
+# agree on the depth. The limits on depth are relative to it.
+MIN_ALPHA = 0.8
+MAX_DEPTH_STEP = 0.05
+MAX_DEPTH_STD = 0.1
+# The splats of a pixel lie scattered round the surface, and their mean is closer to it than they are.
+DEPTH_SIGMA_PER_STD = 0.3
+
+
+@dataclass(frozen=True, eq=False)
+class Lifted:
+    """Points of the map under pixels of a render.
+
+    Attributes:
+        points: (M, 3) float64, map frame; NaN where not valid.
+        sigmas: (M, 3) float64, one standard deviation of each point along its ray, map frame; NaN where not valid.
+        valid: (M,) bool, whether the depth could be trusted.
+    """
+
+    points: np.ndarray
+    sigmas: np.ndarray
+    valid: np.ndarray
+
+
+def lift(render: Render, camera: Camera, T_map_camera: np.ndarray, pixels: np.ndarray) -> Lifted:
+    """Lift pixels (M, 2) of `render`, drawn with `camera` at `T_map_camera` (4, 4), by bilinear depth.
+
+    Pixels outside the image, on edges of the depth, on thin splats or on scattered ones are not valid.
+    """
+    height, width = render.depth.shape
+    x, y = pixels[:, 0], pixels[:, 1]
+    inside = (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
+    column = np.clip(np.floor(np.where(inside, x, 0)).astype(int), 0, max(width - 2, 0))
+    row = np.clip(np.floor(np.where(inside, y, 0)).astype(int), 0, max(height - 2, 0))
+    rows = row[:, None] + np.array([0, 0, 1, 1]) * (height > 1)
+    columns = column[:, None] + np.array([0, 1, 0, 1]) * (width > 1)
+    fx, fy = np.clip(x - column, 0, 1), np.clip(y - row, 0, 1)
+    weights = np.stack([(1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy], axis=1)
+
+    depths = render.depth[rows, columns].astype(np.float64)  # (M, 4), NaN where there is none
+    depth = (weights * depths).sum(axis=1)
+    depth_std = (weights * render.depth_std[rows, columns]).sum(axis=1)
+    # Comparisons with NaN are false: what has no depth is not valid.
+    valid = (
+        inside
+        & (render.alpha[rows, columns].min(axis=1) >= MIN_ALPHA)
+        & (depths.max(axis=1) - depths.min(axis=1) <= MAX_DEPTH_STEP * depth)
+        & (depth_std <= MAX_DEPTH_STD * depth)
+    )
+    depth = np.where(valid, depth, np.nan)
+    rays = camera.rays(pixels)
+    points = transform(T_map_camera, rays * depth[:, None])
+    sigmas = (rays * (DEPTH_SIGMA_PER_STD * depth_std)[:, None]) @ T_map_camera[:3, :3].T
+    return Lifted(points, np.where(valid[:, None], sigmas, np.nan), valid)

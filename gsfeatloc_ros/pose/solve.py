@@ -1,0 +1,195 @@
+"""The pose of a camera from 2D-3D matches: LO-RANSAC by PoseLib, then a robust refinement with its covariance.
+
+PoseLib was chosen over OpenCV's USAC by measurement: `python -m gsfeatloc_ros.tools.benchmark pnp`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import poselib
+
+from gsfeatloc_ros.camera import Camera
+from gsfeatloc_ros.geometry import invert, make_pose, skew, so3_exp
+
+_MIN_ITERATIONS, _MAX_ITERATIONS = 200, 10_000
+# A P3P sample and one match to choose among its solutions; under-determined sets have no covariance.
+MIN_POINTS = 4
+# Keypoints are no better than this, however well a few of them happen to agree.
+_MIN_PIXEL_SIGMA = 0.1
+_REFINE_ITERATIONS = 20
+_CONVERGED = 1e-10
+
+
+@dataclass(frozen=True, eq=False)
+class PoseSolution:
+    """A pose and how well the matches agree with it.
+
+    Attributes:
+        T_map_camera: (4, 4) float64.
+        covariance: (6, 6) float64, ROS order (x y z, rotation about x y z), axes of the map frame.
+        inliers: (M,) bool, matches within the threshold.
+        reprojection_error: RMS over the inliers, pixels.
+    """
+
+    T_map_camera: np.ndarray
+    covariance: np.ndarray
+    inliers: np.ndarray
+    reprojection_error: float
+
+
+def solve_pose(
+    camera: Camera, pixels: np.ndarray, points: np.ndarray, sigmas: np.ndarray, max_error: float, seed: int
+) -> PoseSolution | None:
+    """Find the pose from which `points` are seen at `pixels`.
+
+    Args:
+        camera: pinhole intrinsics; its distortion is ignored.
+        pixels: (M, 2) undistorted.
+        points: (M, 3) in the map frame.
+        sigmas: (M, 3) one standard deviation of each point along the ray it was lifted on, map frame.
+        max_error: reprojection error in pixels up to which a match is an inlier.
+        seed: of RANSAC's sampling.
+
+    Returns:
+        The solution, or None where fewer than MIN_POINTS matches agree on a pose.
+    """
+    if len(pixels) < MIN_POINTS:
+        return None
+    pinhole = {
+        "model": "PINHOLE",
+        "width": camera.width,
+        "height": camera.height,
+        "params": [camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2]],
+    }
+    ransac = {
+        "max_reproj_error": max_error,
+        "min_iterations": _MIN_ITERATIONS,
+        "max_iterations": _MAX_ITERATIONS,
+        "seed": seed,
+    }
+    found, info = poselib.estimate_absolute_pose(pixels, points, pinhole, ransac, {})
+    inliers = np.asarray(info["inliers"], dtype=bool)
+    pose = make_pose(found.R, found.t)
+    if inliers.sum() < MIN_POINTS or not np.isfinite(pose).all():
+        return None
+    T_map_camera, covariance = refine_pose(camera, invert(pose), pixels[inliers], points[inliers], sigmas[inliers])
+    if T_map_camera is None:
+        return None
+    errors = reprojection_errors(camera, T_map_camera, pixels, points)
+    inliers = errors <= max_error
+    if inliers.sum() < MIN_POINTS:
+        return None
+    return PoseSolution(T_map_camera, covariance, inliers, float(np.sqrt(np.mean(errors[inliers] ** 2))))
+
+
+def reprojection_errors(camera: Camera, T_map_camera: np.ndarray, pixels: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Distances (M,) in pixels between `pixels` (M, 2) and the projected `points` (M, 3); inf behind the camera."""
+    in_camera = (points - T_map_camera[:3, 3]) @ T_map_camera[:3, :3]
+    errors = np.full(len(points), np.inf)
+    ahead = in_camera[:, 2] > 0
+    errors[ahead] = np.linalg.norm(camera.project(in_camera[ahead]) - pixels[ahead], axis=1)
+    return errors
+
+
+def refine_pose(
+    camera: Camera, T_map_camera: np.ndarray, pixels: np.ndarray, points: np.ndarray, sigmas: np.ndarray
+) -> tuple[np.ndarray, np.ndarray] | tuple[None, None]:
+    """Levenberg-Marquardt on the reprojection errors, whitened, with Cauchy's loss.
+
+    A residual's covariance is the keypoints' noise, measured on the residuals, plus the projection of the point's own
+    uncertainty along the ray on which it was lifted.
+
+    Args and shapes as for `solve_pose`; `T_map_camera` is where to start.
+
+    Returns:
+        The refined pose (4, 4) and its covariance (6, 6): the inverse of the Hessian, inflated by the residuals' scale.
+        (None, None) where a point falls behind the camera or the matches do not determine the pose.
+    """
+    pose = T_map_camera
+    damping = 1e-4
+    residuals, jacobian, point_jacobian = _linearize(camera, pose, pixels, points)
+    if residuals is None:
+        return None, None
+    # Of a 2D Gaussian, the median of the squared length is 2 ln 2 variances.
+    noise = max(np.median((residuals**2).sum(axis=1)) / (2 * np.log(2)), _MIN_PIXEL_SIGMA**2)
+    smear = np.einsum("mij,mj->mi", point_jacobian, sigmas)
+    whitening = _inverse_root(noise * np.eye(2) + smear[:, :, None] * smear[:, None, :])
+
+    def cost(residuals: np.ndarray) -> float:
+        return float(np.log1p((_apply(whitening, residuals) ** 2).sum(axis=1)).sum())
+
+    current = cost(residuals)
+    for _ in range(_REFINE_ITERATIONS):
+        hessian, gradient = _normal_equations(whitening, residuals, jacobian)
+        try:
+            step = np.linalg.solve(hessian + damping * np.diag(np.diag(hessian)), -gradient)
+        except np.linalg.LinAlgError:
+            return None, None
+        candidate = make_pose(so3_exp(step[3:]) @ pose[:3, :3], pose[:3, 3] + step[:3])
+        linearized = _linearize(camera, candidate, pixels, points)
+        if linearized[0] is None or (cost_there := cost(linearized[0])) > current:
+            damping *= 10
+            continue
+        converged = current - cost_there <= _CONVERGED * current
+        pose, current, damping = candidate, cost_there, damping / 10
+        residuals, jacobian, _ = linearized
+        if converged:
+            break
+
+    hessian, _ = _normal_equations(whitening, residuals, jacobian)
+    try:
+        covariance = np.linalg.inv(hessian)
+    except np.linalg.LinAlgError:
+        return None, None
+    if not (np.isfinite(covariance).all() and np.linalg.eigvalsh(covariance)[0] > 0):
+        return None, None
+    squared = (_apply(whitening, residuals) ** 2).sum(axis=1)
+    weights = 1.0 / (1.0 + squared)
+    degrees_of_freedom = max(2 * weights.sum() - 6, 1.0)
+    inflation = max((weights * squared).sum() / degrees_of_freedom, 1.0)
+    return pose, covariance * inflation
+
+
+def _linearize(camera: Camera, pose: np.ndarray, pixels: np.ndarray, points: np.ndarray):
+    """Residuals (M, 2), their Jacobians (M, 2, 6) by (translation, rotation) of the pose, and (M, 2, 3) by the point.
+
+    The pose moves as t + dt, exp(dr) R, both in the map frame. All None where a point is not ahead of the camera.
+    """
+    R_camera_map = pose[:3, :3].T
+    offsets = points - pose[:3, 3]
+    x, y, z = (offsets @ R_camera_map.T).T
+    if not (z > 0).all():
+        return None, None, None
+    fx, fy, skewness = camera.K[0, 0], camera.K[1, 1], camera.K[0, 1]
+    zero = np.zeros_like(z)
+    by_camera_point = np.stack(
+        [
+            np.stack([fx / z, skewness / z, -(fx * x + skewness * y) / z**2], axis=1),
+            np.stack([zero, fy / z, -fy * y / z**2], axis=1),
+        ],
+        axis=1,
+    )
+    by_point = by_camera_point @ R_camera_map
+    residuals = camera.project(np.stack([x, y, z], axis=1)) - pixels
+    return residuals, np.concatenate([-by_point, by_point @ skew(offsets)], axis=2), by_point
+
+
+def _normal_equations(whitening: np.ndarray, residuals: np.ndarray, jacobian: np.ndarray):
+    """Hessian (6, 6) and gradient (6,) of the Cauchy-weighted problem (iteratively reweighted least squares)."""
+    white_residuals = _apply(whitening, residuals)
+    white_jacobian = whitening @ jacobian
+    weights = 1.0 / (1.0 + (white_residuals**2).sum(axis=1))
+    weighted = white_jacobian * weights[:, None, None]
+    return np.einsum("mri,mrj->ij", weighted, white_jacobian), np.einsum("mri,mr->i", weighted, white_residuals)
+
+
+def _inverse_root(covariances: np.ndarray) -> np.ndarray:
+    """Matrices W (M, 2, 2) with W^T W = inverse of `covariances` (M, 2, 2)."""
+    return np.linalg.inv(np.linalg.cholesky(covariances))
+
+
+def _apply(matrices: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    """Each matrix (M, i, j) times its vector (M, j)."""
+    return np.einsum("mij,mj->mi", matrices, vectors)
