@@ -26,7 +26,7 @@ class LocalizerOptions:
     Attributes:
         max_image_width: wider photos are resized to this many pixels first.
         max_passes: most renders that are matched: one at the prior, the others at the estimates.
-        min_inliers: fewer 2D-3D matches that agree on the pose than this are a failure.
+        min_inliers: fewer 2D-3D matches that agree on the pose than this, in the render at the estimate, are a failure.
         min_inlier_ratio: a smaller share of inliers among the last pass's lifted matches than this is a failure.
         max_reprojection_error: pixels, of the resized photo, within which a match agrees with a pose.
         seed: of RANSAC; the same seed gives the same answer.
@@ -42,6 +42,10 @@ class LocalizerOptions:
 
 # A pass that moves what the camera sees by less than this many pixels has settled.
 _SETTLED_PIXELS = 0.1
+# The render at the prior, seen from elsewhere and lifted by depths that matter more the farther off it is, only has to
+# suggest a pose: this few inliers do, within this many times the reprojection error. The next render is the judge.
+_MIN_HINT = 8
+_HINT_LOOSENESS = 2.0
 # Views differ a little in what can be matched: fewer inliers than this share of the last pass's are worse.
 _WORSE = 0.9
 
@@ -84,43 +88,37 @@ class Localizer:
 
     def _estimate(self, query: Features, camera: Camera, T_map_camera_prior: np.ndarray, clock: _Clock) -> Estimate:
         """Render and solve at the prior, then at each estimate, until it settles."""
+        options = self._options
         best: _Pass | None = None
         pose = T_map_camera_prior
-        for number in range(1, self._options.max_passes + 1):
-            current = self._pass(query, camera, pose, clock)
-            shortage = self._shortage(query, current)
-            if shortage and number <= 2:
-                where = "prior" if number == 1 else "estimate"
-                reason = f"{shortage} between the photo and the render at the {where}"
-                return Estimate(
-                    Status.FAILED,
-                    reason,
-                    matches=current.matches,
-                    inliers=current.inliers,
-                    passes=number,
-                    last_render=current.render,
-                )
-            if shortage or (best is not None and current.inliers < _WORSE * best.inliers):
+        for number in range(1, options.max_passes + 1):
+            max_error = options.max_reprojection_error * (_HINT_LOOSENESS if number == 1 else 1.0)
+            current = self._pass(query, camera, pose, max_error, clock)
+            if number > 2 and current.inliers < _WORSE * best.inliers:
                 break
-            settled = best is not None and _moved(camera, best, current) < _SETTLED_PIXELS
-            best, pose = current, current.solution.T_map_camera
-            if settled:
+            settled = number > 1 and current.solution and _moved(camera, best, current) < _SETTLED_PIXELS
+            best = current
+            if settled or current.inliers < _MIN_HINT:
                 break
-        solution = best.solution
-        return Estimate(
-            Status.LOCALIZED,
-            f"{best.inliers} inliers of {best.matches} matches after {number} passes",
-            solution.T_map_camera,
-            solution.covariance,
-            best.matches,
-            best.inliers,
-            solution.reprojection_error,
-            number,
-            correspondences=best.lifted_matches.select(solution.inliers),
-            last_render=best.render,
+            pose = current.solution.T_map_camera
+
+        shortage = self._shortage(query, best, "prior" if number == 1 else "estimate")
+        evidence = Estimate(
+            Status.FAILED, shortage, matches=best.matches, inliers=best.inliers, passes=number, last_render=best.render
+        )
+        if shortage:
+            return evidence
+        return replace(
+            evidence,
+            status=Status.LOCALIZED,
+            reason=f"{best.inliers} inliers of {best.matches} matches after {number} passes",
+            T_map_camera=best.solution.T_map_camera,
+            covariance=best.solution.covariance,
+            reprojection_error=best.solution.reprojection_error,
+            correspondences=best.lifted_matches.select(best.solution.inliers),
         )
 
-    def _pass(self, query: Features, camera: Camera, pose: np.ndarray, clock: _Clock) -> _Pass:
+    def _pass(self, query: Features, camera: Camera, pose: np.ndarray, max_error: float, clock: _Clock) -> _Pass:
         """Render at `pose`, match, lift and solve."""
         with clock.stage("render"):
             render = self._renderer.render(camera, pose)
@@ -137,25 +135,22 @@ class Localizer:
                 camera.undistort(lifted_matches.a),
                 points,
                 lifted.sigmas[lifted.valid],
-                self._options.max_reprojection_error,
+                max_error,
                 self._options.seed,
             )
         return _Pass(render, len(matches), lifted_matches, points, solution)
 
-    def _shortage(self, query: Features, current: _Pass) -> str:
+    def _shortage(self, query: Features, current: _Pass, where: str) -> str:
         """What a pass has too little of to be believed, in words; "" if nothing."""
         options = self._options
-        if len(query) < options.min_inliers:
-            return f"{len(query)} features in the photo (at least {options.min_inliers} needed): no match"
-        if len(current.lifted_matches) < options.min_inliers:
-            return (
-                f"{current.matches} matches, {len(current.lifted_matches)} of them with a depth "
-                f"(at least {options.min_inliers} needed)"
-            )
-        least = max(options.min_inliers, int(np.ceil(options.min_inlier_ratio * len(current.lifted_matches))))
-        if current.inliers < least:
-            return f"{current.inliers} inliers of {len(current.lifted_matches)} matches (at least {least} needed)"
-        return ""
+        lifted = len(current.lifted_matches)
+        needed = max(_MIN_HINT, options.min_inliers, int(np.ceil(options.min_inlier_ratio * lifted)))
+        if current.inliers >= needed:
+            return ""
+        return (
+            f"photo and render at the {where} do not agree: {len(query)} features, {current.matches} matches, "
+            f"{lifted} with depth, {current.inliers} inliers (at least {needed} needed)"
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,13 +10,14 @@ from gsfeatloc_ros.camera import Camera
 from gsfeatloc_ros.geometry import transform
 from gsfeatloc_ros.render.base import Render
 
-# A pixel is lifted where its four neighbours are covered by splats, lie on one surface, and the splats that made them
-# agree on the depth. The limits on depth are relative to it.
+# A pixel is lifted where its four neighbours are covered by splats and lie on one surface: the largest step of depth
+# between them, relative to the depth, tells a slope from an edge.
 MIN_ALPHA = 0.8
-MAX_DEPTH_STEP = 0.05
-MAX_DEPTH_STD = 0.1
-# The splats of a pixel lie scattered round the surface, and their mean is closer to it than they are.
+MAX_DEPTH_STEP = 0.1
+# The splats of a pixel lie scattered round the surface, and their median is closer to it than they are. A floater far
+# in front of the surface spreads the depths without moving the median: the spread counts up to this share of the depth.
 DEPTH_SIGMA_PER_STD = 0.3
+MAX_DEPTH_STD = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,9 +36,10 @@ class Lifted:
 
 
 def lift(render: Render, camera: Camera, T_map_camera: np.ndarray, pixels: np.ndarray) -> Lifted:
-    """Lift pixels (M, 2) of `render`, drawn with `camera` at `T_map_camera` (4, 4), by bilinear depth.
+    """Lift pixels (M, 2) of `render`, drawn with `camera` at `T_map_camera` (4, 4), by bilinear median depth.
 
-    Pixels outside the image, on edges of the depth, on thin splats or on scattered ones are not valid.
+    The median, not the mean: semi-transparent floaters between the camera and the surface drag the mean along.
+    Pixels outside the image, on edges of the depth or on thin splats are not valid.
     """
     height, width = render.depth.shape
     x, y = pixels[:, 0], pixels[:, 1]
@@ -49,15 +51,14 @@ def lift(render: Render, camera: Camera, T_map_camera: np.ndarray, pixels: np.nd
     fx, fy = np.clip(x - column, 0, 1), np.clip(y - row, 0, 1)
     weights = np.stack([(1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy], axis=1)
 
-    depths = render.depth[rows, columns].astype(np.float64)  # (M, 4), NaN where there is none
+    depths = render.median_depth[rows, columns].astype(np.float64)  # (M, 4), NaN where there is none
     depth = (weights * depths).sum(axis=1)
-    depth_std = (weights * render.depth_std[rows, columns]).sum(axis=1)
+    depth_std = np.minimum((weights * render.depth_std[rows, columns]).sum(axis=1), MAX_DEPTH_STD * depth)
     # Comparisons with NaN are false: what has no depth is not valid.
     valid = (
         inside
         & (render.alpha[rows, columns].min(axis=1) >= MIN_ALPHA)
         & (depths.max(axis=1) - depths.min(axis=1) <= MAX_DEPTH_STEP * depth)
-        & (depth_std <= MAX_DEPTH_STD * depth)
     )
     depth = np.where(valid, depth, np.nan)
     rays = camera.rays(pixels)

@@ -19,6 +19,9 @@ MIN_POINTS = 4
 # Keypoints are no better than this, however well a few of them happen to agree.
 _MIN_PIXEL_SIGMA = 0.1
 _REFINE_ITERATIONS = 20
+# In standard deviations. RANSAC has removed the gross outliers: a narrower loss would waste good matches.
+_CAUCHY_SCALE = 2.4
+_NOISE_ITERATIONS = 5
 _CONVERGED = 1e-10
 
 
@@ -55,6 +58,24 @@ def solve_pose(
     Returns:
         The solution, or None where fewer than MIN_POINTS matches agree on a pose.
     """
+    found = ransac_pose(camera, pixels, points, max_error, seed)
+    if found is None:
+        return None
+    start, inliers = found
+    T_map_camera, covariance = refine_pose(camera, start, pixels[inliers], points[inliers], sigmas[inliers])
+    if T_map_camera is None:
+        return None
+    errors = reprojection_errors(camera, T_map_camera, pixels, points)
+    inliers = errors <= max_error
+    if inliers.sum() < MIN_POINTS:
+        return None
+    return PoseSolution(T_map_camera, covariance, inliers, float(np.sqrt(np.mean(errors[inliers] ** 2))))
+
+
+def ransac_pose(
+    camera: Camera, pixels: np.ndarray, points: np.ndarray, max_error: float, seed: int
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """LO-RANSAC with P3P: the pose T_map_camera (4, 4) and its inliers (M,) bool, or None; args of `solve_pose`."""
     if len(pixels) < MIN_POINTS:
         return None
     pinhole = {
@@ -69,19 +90,12 @@ def solve_pose(
         "max_iterations": _MAX_ITERATIONS,
         "seed": seed,
     }
-    found, info = poselib.estimate_absolute_pose(pixels, points, pinhole, ransac, {})
+    pose, info = poselib.estimate_absolute_pose(pixels, points, pinhole, ransac, {})
     inliers = np.asarray(info["inliers"], dtype=bool)
-    pose = make_pose(found.R, found.t)
-    if inliers.sum() < MIN_POINTS or not np.isfinite(pose).all():
+    T_camera_map = make_pose(pose.R, pose.t)
+    if inliers.sum() < MIN_POINTS or not np.isfinite(T_camera_map).all():
         return None
-    T_map_camera, covariance = refine_pose(camera, invert(pose), pixels[inliers], points[inliers], sigmas[inliers])
-    if T_map_camera is None:
-        return None
-    errors = reprojection_errors(camera, T_map_camera, pixels, points)
-    inliers = errors <= max_error
-    if inliers.sum() < MIN_POINTS:
-        return None
-    return PoseSolution(T_map_camera, covariance, inliers, float(np.sqrt(np.mean(errors[inliers] ** 2))))
+    return invert(T_camera_map), inliers
 
 
 def reprojection_errors(camera: Camera, T_map_camera: np.ndarray, pixels: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -112,13 +126,10 @@ def refine_pose(
     residuals, jacobian, point_jacobian = _linearize(camera, pose, pixels, points)
     if residuals is None:
         return None, None
-    # Of a 2D Gaussian, the median of the squared length is 2 ln 2 variances.
-    noise = max(np.median((residuals**2).sum(axis=1)) / (2 * np.log(2)), _MIN_PIXEL_SIGMA**2)
-    smear = np.einsum("mij,mj->mi", point_jacobian, sigmas)
-    whitening = _inverse_root(noise * np.eye(2) + smear[:, :, None] * smear[:, None, :])
+    whitening = _whitening(residuals, _apply(point_jacobian, sigmas))
 
     def cost(residuals: np.ndarray) -> float:
-        return float(np.log1p((_apply(whitening, residuals) ** 2).sum(axis=1)).sum())
+        return float(np.log1p((_apply(whitening, residuals) ** 2).sum(axis=1) / _CAUCHY_SCALE**2).sum())
 
     current = cost(residuals)
     for _ in range(_REFINE_ITERATIONS):
@@ -146,7 +157,7 @@ def refine_pose(
     if not (np.isfinite(covariance).all() and np.linalg.eigvalsh(covariance)[0] > 0):
         return None, None
     squared = (_apply(whitening, residuals) ** 2).sum(axis=1)
-    weights = 1.0 / (1.0 + squared)
+    weights = _cauchy_weights(squared)
     degrees_of_freedom = max(2 * weights.sum() - 6, 1.0)
     inflation = max((weights * squared).sum() / degrees_of_freedom, 1.0)
     return pose, covariance * inflation
@@ -180,14 +191,31 @@ def _normal_equations(whitening: np.ndarray, residuals: np.ndarray, jacobian: np
     """Hessian (6, 6) and gradient (6,) of the Cauchy-weighted problem (iteratively reweighted least squares)."""
     white_residuals = _apply(whitening, residuals)
     white_jacobian = whitening @ jacobian
-    weights = 1.0 / (1.0 + (white_residuals**2).sum(axis=1))
+    weights = _cauchy_weights((white_residuals**2).sum(axis=1))
     weighted = white_jacobian * weights[:, None, None]
     return np.einsum("mri,mrj->ij", weighted, white_jacobian), np.einsum("mri,mr->i", weighted, white_residuals)
 
 
-def _inverse_root(covariances: np.ndarray) -> np.ndarray:
-    """Matrices W (M, 2, 2) with W^T W = inverse of `covariances` (M, 2, 2)."""
-    return np.linalg.inv(np.linalg.cholesky(covariances))
+def _cauchy_weights(squared: np.ndarray) -> np.ndarray:
+    """Weights (M,) of residuals by their squared whitened lengths (M,)."""
+    return 1.0 / (1.0 + squared / _CAUCHY_SCALE**2)
+
+
+def _whitening(residuals: np.ndarray, smears: np.ndarray) -> np.ndarray:
+    """Matrices W (M, 2, 2) with W^T W the inverse covariances of the residuals (M, 2).
+
+    A covariance is the smear (M, 2) of the point's uncertainty, in pixels, and the keypoints' noise, which is chosen so
+    that the median whitened residual is as long as a Gaussian's.
+    """
+    smear_covariances = smears[:, :, None] * smears[:, None, :]
+    # Of a 2D Gaussian, the median of the squared length is 2 ln 2 variances.
+    median_of_unit = 2 * np.log(2)
+    noise = np.median((residuals**2).sum(axis=1)) / median_of_unit
+    for _ in range(_NOISE_ITERATIONS):
+        noise = max(noise, _MIN_PIXEL_SIGMA**2)
+        whitening = np.linalg.inv(np.linalg.cholesky(noise * np.eye(2) + smear_covariances))
+        noise *= np.median((_apply(whitening, residuals) ** 2).sum(axis=1)) / median_of_unit
+    return whitening
 
 
 def _apply(matrices: np.ndarray, vectors: np.ndarray) -> np.ndarray:

@@ -28,12 +28,15 @@ class Render:
     Attributes:
         rgb: (H, W, 3) float32 in [0, 1].
         depth: (H, W) float32, alpha-weighted mean z-depth in map units; NaN where alpha < DEPTH_MIN_ALPHA.
+        median_depth: (H, W) float32, z-depth in map units of the Gaussian at which the transmittance falls to a half;
+            floaters that cover less than that do not move it, as they do the mean; NaN where depth is.
         depth_std: (H, W) float32, spread of the depths that made the pixel, in map units; NaN where depth is.
         alpha: (H, W) float32 in [0, 1], how much of the pixel the splats cover.
     """
 
     rgb: np.ndarray
     depth: np.ndarray
+    median_depth: np.ndarray
     depth_std: np.ndarray
     alpha: np.ndarray
 

@@ -71,9 +71,9 @@ class CpuRenderer:
 
         shape = (camera.height, camera.width)
         rgb = np.empty((*shape, 3), dtype=np.float32)
-        depth, depth_std, alpha = (np.empty(shape, dtype=np.float32) for _ in range(3))
-        kernels.blend(self._splats, by_tile, starts, self._threads, self._background, rgb, depth, depth_std, alpha)
-        return Render(rgb, depth, depth_std, alpha)
+        images = [np.empty(shape, dtype=np.float32) for _ in range(4)]
+        kernels.blend(self._splats, by_tile, starts, self._threads, self._background, rgb, *images)
+        return Render(rgb, *images)
 
 
 class _PairBuffers:

@@ -316,7 +316,7 @@ def _sort_by_depth(splats, members, keys, order, spare_keys, spare_order):
 
 
 @njit(parallel=True, nogil=True, cache=True, fastmath=_MATH)
-def blend(splats, by_tile, starts, threads, background, rgb, depth, depth_std, alpha):
+def blend(splats, by_tile, starts, threads, background, rgb, depth, median_depth, depth_std, alpha):
     """Sort each tile's splats by depth and blend them front to back into the images.
 
     Args:
@@ -324,7 +324,7 @@ def blend(splats, by_tile, starts, threads, background, rgb, depth, depth_std, a
         by_tile, starts: splats of each tile, from `gather` and `tile_starts`.
         threads: number of workers; each takes every so many-th tile, so that crowded corners are shared.
         background: (3,) float32.
-        rgb (H, W, 3), depth, depth_std, alpha (H, W): float32, written.
+        rgb (H, W, 3), depth, median_depth, depth_std, alpha (H, W): float32, written.
     """
     height, width = depth.shape
     tiles_x = -(-width // TILE)
@@ -339,7 +339,7 @@ def blend(splats, by_tile, starts, threads, background, rgb, depth, depth_std, a
         transmittance = np.empty(TILE * TILE, dtype=np.float32)
         running = np.empty(TILE * TILE, dtype=np.float32)  # 1 until the ray has ended
         red, green, blue = np.empty_like(running), np.empty_like(running), np.empty_like(running)
-        moment1, moment2 = np.empty_like(running), np.empty_like(running)
+        moment1, moment2, median = np.empty_like(running), np.empty_like(running), np.empty_like(running)
         row_running = np.empty(TILE, dtype=np.bool_)
         columns = np.arange(TILE).astype(np.float32)
 
@@ -357,6 +357,7 @@ def blend(splats, by_tile, starts, threads, background, rgb, depth, depth_std, a
             blue[:] = _ZERO
             moment1[:] = _ZERO
             moment2[:] = _ZERO
+            median[:] = _ZERO
             row_running[:] = True
             rows_running = rows
             # Depths are summed from the nearest one on: the spread is a difference of squares.
@@ -387,6 +388,7 @@ def blend(splats, by_tile, starts, threads, background, rgb, depth, depth_std, a
                         weight = _ZERO if ends else t * a
                         running[at] = _ZERO if ends else running[at]
                         transmittance[at] = t - weight
+                        median[at] = z if t > _HALF and weight > _ZERO else median[at]
                         red[at] += weight * r
                         green[at] += weight * g
                         blue[at] += weight * b
@@ -415,7 +417,9 @@ def blend(splats, by_tile, starts, threads, background, rgb, depth, depth_std, a
                     if covered >= _DEPTH_MIN_ALPHA:
                         mean = moment1[at] / covered
                         depth[y, x] = nearest + mean
+                        median_depth[y, x] = nearest + median[at]
                         depth_std[y, x] = math.sqrt(max(moment2[at] / covered - mean * mean, _ZERO))
                     else:
                         depth[y, x] = _NAN
+                        median_depth[y, x] = _NAN
                         depth_std[y, x] = _NAN

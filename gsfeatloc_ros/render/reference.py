@@ -52,6 +52,7 @@ class ReferenceRenderer:
         rgb = torch.zeros(camera.height, camera.width, 3, dtype=torch.float64)
         moments = torch.zeros(camera.height, camera.width, 3, dtype=torch.float64)  # weight, weight z, weight z^2
         transmittance = torch.ones(camera.height, camera.width, dtype=torch.float64)
+        median = torch.full((camera.height, camera.width), torch.nan, dtype=torch.float64)
         running = torch.ones(camera.height, camera.width, dtype=torch.bool)
 
         indices = torch.nonzero(visible).ravel()
@@ -73,16 +74,17 @@ class ReferenceRenderer:
             rgb[box] += weight[..., None] * colors[index]
             z = points[index, 2]
             moments[box] += weight[..., None] * torch.stack([torch.ones_like(z), z, z * z])
+            halves = drawn & (transmittance[box] > 0.5) & (after <= 0.5)
+            median[box] = torch.where(halves, z, median[box])
             transmittance[box] = torch.where(drawn, after, transmittance[box])
 
         rgb += transmittance[..., None] * self._background
         alpha = 1.0 - transmittance
         depth = moments[..., 1] / moments[..., 0]
         spread = torch.sqrt((moments[..., 2] / moments[..., 0] - depth**2).clamp(min=0.0))
-        hidden = alpha < DEPTH_MIN_ALPHA
-        depth[hidden] = torch.nan
-        spread[hidden] = torch.nan
-        return Render(*(image.float().numpy() for image in (rgb.clamp(max=1.0), depth, spread, alpha)))
+        for image in (depth, median, spread):
+            image[alpha < DEPTH_MIN_ALPHA] = torch.nan
+        return Render(*(image.float().numpy() for image in (rgb.clamp(max=1.0), depth, median, spread, alpha)))
 
 
 def _covariances(gaussian_map: GaussianMap) -> torch.Tensor:

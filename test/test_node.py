@@ -1,0 +1,130 @@
+"""The installed localizer over DDS: what it does with good input."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from node_harness import (
+    Client,
+    assert_close,
+    connected_client,
+    info_of,
+    prior_of,
+    rgb_image,
+    running_localizer,
+    text,
+)
+
+
+@pytest.fixture(scope="module")
+def localizer(room_map_file):
+    with running_localizer(map__path=room_map_file, matcher__name="sift") as process:
+        yield process
+
+
+@pytest.fixture
+def client(localizer):
+    with connected_client() as client:
+        yield client
+
+
+@pytest.fixture
+def query(room_queries):
+    return room_queries[0]
+
+
+def send_inputs(client: Client, camera, query) -> None:
+    client.send_camera_info(info_of(camera))
+    client.send_prior(prior_of(query.T_map_camera_prior))
+
+
+def test_image_and_prior_give_the_pose(client, room_camera, query):
+    send_inputs(client, room_camera, query)
+    image = rgb_image(query.image)
+    diagnostic = client.attempt(image)
+    assert diagnostic.ok, diagnostic
+    assert diagnostic.values["status"] == "localized"
+    assert int(diagnostic.values["inliers"]) >= 20
+    assert float(diagnostic.values["ms_total"]) > 0
+    pose = client.pose_of(image)
+    assert pose.header.frame_id == "map"
+    assert pose.header.stamp == image.header.stamp
+    assert_close(pose, query.T_map_camera)
+    covariance = np.reshape(pose.pose.covariance, (6, 6))
+    assert np.allclose(covariance, covariance.T)
+    assert (np.linalg.eigvalsh(covariance) > 0).all()
+    # A standard deviation in metres and radians that a pose within 2 cm and 1 degree can have.
+    assert np.sqrt(np.diag(covariance)).max() < 0.1
+
+
+def test_late_subscriber_gets_the_last_pose(client, room_camera, query):
+    send_inputs(client, room_camera, query)
+    image = rgb_image(query.image)
+    assert client.attempt(image).ok
+    with connected_client() as late:
+        assert late.pose_of(image) is not None
+
+
+def test_rendered_image_is_the_map_seen_from_the_estimate(client, room, room_camera, query):
+    client.listen_to_renders()
+    send_inputs(client, room_camera, query)
+    image = rgb_image(query.image)
+    assert client.attempt(image).ok
+    assert client.spin_until(lambda: any(text(render) == text(image) for render in client.renders))
+    render = next(render for render in client.renders if text(render) == text(image))
+    assert (render.encoding, render.header.frame_id) == ("rgb8", "camera_optical")
+    rendered = np.frombuffer(render.data, np.uint8).reshape(render.height, render.width, 3) / 255.0
+    # The room as a pinhole camera at the true pose would see it.
+    pinhole = replace(room_camera.scaled(render.width, render.height), distortion=np.zeros(0))
+    seen = room.trace(pinhole, query.T_map_camera).rgb
+    assert np.corrcoef(rendered.ravel(), seen.ravel())[0, 1] > 0.9
+
+
+def test_service_localizes_the_newest_image(client, room_camera, query):
+    send_inputs(client, room_camera, query)
+    image = rgb_image(query.image)
+    assert client.attempt(image).ok
+    client.poses.clear()
+    answer = client.relocalize()
+    assert answer.success, answer.message
+    assert_close(client.pose_of(image), query.T_map_camera)
+
+
+def test_service_tells_of_failure(client, room_camera, query):
+    send_inputs(client, room_camera, query)
+    image = rgb_image(np.zeros_like(query.image))
+    assert not client.attempt(image).ok
+    answer = client.relocalize()
+    assert not answer.success
+    assert "features" in answer.message
+    assert client.pose_of(image) is None
+
+
+def test_requests_at_once_are_all_answered(client, room_camera, query):
+    send_inputs(client, room_camera, query)
+    assert client.attempt(rgb_image(query.image)).ok
+    answers = client.relocalize_together(8)
+    assert all(answer.success for answer in answers)
+
+
+def test_newest_image_wins_and_every_one_is_accounted_for(client, room_camera, query):
+    send_inputs(client, room_camera, query)
+    before = client.attempt(rgb_image(query.image)).values
+    seen = len(client.diagnostics)
+    for _ in range(30):
+        image = rgb_image(query.image)
+        image.header.stamp = client.next_stamp()
+        client.send_image(image)
+        client.spin(0.02)
+    last = client.attempt(rgb_image(query.image))
+    assert last.ok
+    client.spin(1.0)
+    attempts = client.diagnostics[seen:]
+    received = int(attempts[-1].values["images_received"]) - int(before["images_received"])
+    dropped = int(attempts[-1].values["images_dropped"]) - int(before["images_dropped"])
+    assert dropped > 0
+    assert received - dropped == len(attempts)
+    stamps = [float(diagnostic.values["stamp"]) for diagnostic in attempts]
+    assert stamps == sorted(stamps)

@@ -1,0 +1,50 @@
+"""An exception that nobody foresaw, in a node of this process: no other localizer may run beside it."""
+
+from __future__ import annotations
+
+import threading
+
+import rclpy
+from node_harness import assert_close, connected_client, info_of, node_arguments, prior_of, rgb_image
+
+from gsfeatloc_ros.node.localizer_node import LocalizerNode
+
+
+class OutOfMemoryOnce:
+    """A localizer whose first image goes wrong in a way that nobody foresaw."""
+
+    def __init__(self, localizer) -> None:
+        self._localizer = localizer
+        self._calls = 0
+
+    def localize(self, *arguments):
+        self._calls += 1
+        if self._calls == 1:
+            raise MemoryError("Unable to allocate 3 TiB")
+        return self._localizer.localize(*arguments)
+
+
+def test_unforeseen_exception_is_reported_and_survived(room_map_file, room_camera, room_queries):
+    query = room_queries[0]
+    rclpy.init(args=node_arguments(map__path=room_map_file, matcher__name="sift"))
+    node = LocalizerNode()
+    node._localizer = OutOfMemoryOnce(node._localizer)
+    spinning = threading.Thread(target=rclpy.spin, args=(node,))
+    spinning.start()
+    try:
+        with connected_client() as client:
+            client.send_camera_info(info_of(room_camera))
+            client.send_prior(prior_of(query.T_map_camera_prior))
+            image = rgb_image(query.image)
+            diagnostic = client.attempt(image)
+            assert diagnostic.values["status"] == "error"
+            assert diagnostic.reason == "MemoryError: Unable to allocate 3 TiB"
+            assert client.pose_of(image) is None
+            image = rgb_image(query.image)
+            assert client.attempt(image).ok
+            assert_close(client.pose_of(image), query.T_map_camera)
+    finally:
+        assert node.stop(10.0)
+        rclpy.shutdown()
+        spinning.join(10.0)
+        node.destroy_node()

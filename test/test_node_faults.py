@@ -1,0 +1,200 @@
+"""What the localizer does with input that cannot be used: it says what is wrong, publishes no pose, and goes on."""
+
+from __future__ import annotations
+
+import math
+import re
+
+import numpy as np
+import pytest
+from node_harness import (
+    Client,
+    assert_close,
+    connected_client,
+    info_of,
+    prior_of,
+    rgb_image,
+    running_localizer,
+)
+from sensor_msgs.msg import CameraInfo, Image
+
+
+@pytest.fixture(scope="module")
+def localizer(room_map_file):
+    with running_localizer(map__path=room_map_file, matcher__name="sift") as process:
+        yield process
+
+
+@pytest.fixture
+def client(localizer):
+    with connected_client() as client:
+        yield client
+
+
+@pytest.fixture
+def query(room_queries):
+    return room_queries[0]
+
+
+@pytest.fixture
+def good_prior(query):
+    return prior_of(query.T_map_camera_prior)
+
+
+@pytest.fixture
+def good_info(room_camera):
+    return info_of(room_camera)
+
+
+def send_good_inputs(client: Client, good_info, good_prior) -> None:
+    client.send_camera_info(good_info)
+    client.send_prior(good_prior)
+
+
+def assert_no_answer(client: Client, localizer, image: Image, says: str) -> None:
+    """The image is refused with the reason in log and diagnostic, and there is no pose for it."""
+    diagnostic = client.attempt(image)
+    assert re.search(says, diagnostic.reason), diagnostic
+    assert not diagnostic.ok
+    assert diagnostic.values["status"] in ("refused", "failed")
+    localizer.wait_for_output(rf"\[WARN\].*{says}")
+    assert client.pose_of(image) is None
+
+
+def assert_answer(client: Client, query) -> None:
+    """The next good image is answered."""
+    image = rgb_image(query.image)
+    diagnostic = client.attempt(image)
+    assert diagnostic.ok, diagnostic
+    assert_close(client.pose_of(image), query.T_map_camera)
+
+
+def test_no_prior_yet(room_map_file, good_info, good_prior, query):
+    with (
+        running_localizer(map__path=room_map_file, matcher__name="sift") as localizer,
+        connected_client() as client,
+    ):
+        client.send_camera_info(good_info)
+        assert_no_answer(client, localizer, rgb_image(query.image), "no prior yet: publish .* on /prior")
+        client.send_prior(good_prior)
+        assert_answer(client, query)
+
+
+def test_no_camera_info_yet(room_map_file, good_info, good_prior, query):
+    with (
+        running_localizer(map__path=room_map_file, matcher__name="sift") as localizer,
+        connected_client() as client,
+    ):
+        client.send_prior(good_prior)
+        assert_no_answer(client, localizer, rgb_image(query.image), "no camera_info yet: publish .* on /camera_info")
+        client.send_camera_info(good_info)
+        assert_answer(client, query)
+
+
+def nan_prior(prior):
+    prior.pose.position.y = math.nan
+    return prior
+
+
+def zero_quaternion_prior(prior):
+    orientation = prior.pose.orientation
+    orientation.x = orientation.y = orientation.z = orientation.w = 0.0
+    return prior
+
+
+def odom_prior(prior):
+    prior.header.frame_id = "odom"
+    return prior
+
+
+@pytest.mark.parametrize(
+    ("spoil", "says"),
+    [
+        (nan_prior, "prior has position .* must be finite"),
+        (zero_quaternion_prior, "prior cannot be used: quaternion .* has no direction"),
+        (odom_prior, "prior is in frame 'odom' but the map is in 'map'"),
+    ],
+)
+def test_prior_that_cannot_be_used(client, localizer, good_info, good_prior, query, spoil, says):
+    send_good_inputs(client, good_info, good_prior)
+    bad = spoil(prior_of(query.T_map_camera_prior))
+    assert client.until_refused(lambda: client.send_prior(bad), says)
+    assert_no_answer(client, localizer, rgb_image(query.image), says)
+    client.send_prior(good_prior)
+    assert_answer(client, query)
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"k": [0.0] * 9}, "K of zeros, the camera is not calibrated"),
+        ({"distortion_model": "thin_prism"}, "distortion model 'thin_prism' is not one of"),
+    ],
+)
+def test_camera_info_that_cannot_be_used(client, localizer, room_camera, good_info, good_prior, query, changes, says):
+    send_good_inputs(client, good_info, good_prior)
+    bad = info_of(room_camera)
+    for name, value in changes.items():
+        setattr(bad, name, value)
+    assert client.until_refused(lambda: client.send_camera_info(bad), says)
+    assert_no_answer(client, localizer, rgb_image(query.image), says)
+    client.send_camera_info(good_info)
+    assert_answer(client, query)
+
+
+def test_camera_info_of_another_size(client, localizer, room_camera, good_info, good_prior, query):
+    bad: CameraInfo = info_of(room_camera.scaled(320, 240))
+    send_good_inputs(client, bad, good_prior)
+    assert_no_answer(client, localizer, rgb_image(query.image), "camera_info is for 320x240 but the image is 640x480")
+    client.send_camera_info(good_info)
+    assert_answer(client, query)
+
+
+def of_unknown_encoding(image):
+    image.encoding = "jpeg"
+    return image
+
+
+def cut_short(image):
+    image.data = image.data[:-1]
+    return image
+
+
+def of_no_size(image):
+    image.width = image.height = image.step = 0
+    image.data = []
+    return image
+
+
+@pytest.mark.parametrize(
+    ("spoil", "says"),
+    [
+        (of_unknown_encoding, "image encoding 'jpeg' is not supported"),
+        (cut_short, "image data has 921599 bytes but step 1920 x height 480 needs 921600"),
+        (of_no_size, "image size 0x0"),
+    ],
+)
+def test_image_that_cannot_be_decoded(client, localizer, good_info, good_prior, query, spoil, says):
+    send_good_inputs(client, good_info, good_prior)
+    assert_no_answer(client, localizer, spoil(rgb_image(query.image)), says)
+    assert not client.relocalize().success
+    assert_answer(client, query)
+
+
+def test_image_of_nothing(client, localizer, good_info, good_prior, query):
+    send_good_inputs(client, good_info, good_prior)
+    assert_no_answer(client, localizer, rgb_image(np.zeros_like(query.image)), "0 features")
+    assert_answer(client, query)
+
+
+def test_stream_of_unusable_images_does_not_flood_the_log(client, localizer, query):
+    seen = len(client.diagnostics)
+    lines = localizer.output.count("'flood' is not supported")
+    for _ in range(30):
+        image = rgb_image(query.image[:4])
+        image.encoding = "flood"
+        client.send_image(image)
+        client.spin(0.05)
+    client.spin(0.5)
+    assert 1 <= localizer.output.count("'flood' is not supported") - lines <= 4
+    assert 1 <= len(client.diagnostics) - seen <= 4

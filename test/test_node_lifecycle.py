@@ -1,0 +1,88 @@
+"""How the installed localizer starts and ends; every test runs its own."""
+
+from __future__ import annotations
+
+import signal
+import time
+
+import pytest
+from node_harness import (
+    TIMEOUT,
+    NodeProcess,
+    connected_client,
+    executable,
+    info_of,
+    node_arguments,
+    prior_of,
+    rgb_image,
+    running_localizer,
+)
+
+
+def test_service_says_what_is_missing(room_map_file):
+    with running_localizer(map__path=room_map_file, matcher__name="sift"), connected_client() as client:
+        answer = client.relocalize()
+        assert not answer.success
+        assert "no image yet: publish sensor_msgs/Image on /image" in answer.message
+        assert "no camera_info yet: publish sensor_msgs/CameraInfo on /camera_info" in answer.message
+        assert "no prior yet: publish geometry_msgs/PoseStamped on /prior" in answer.message
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_signal_while_idle_ends_it_cleanly(room_map_file, number):
+    with running_localizer(map__path=room_map_file, matcher__name="sift") as process:
+        assert_clean_end(process, number)
+
+
+def test_signal_while_busy_answers_the_requests_first(room_map_file, room_camera, room_queries):
+    with running_localizer(map__path=room_map_file, matcher__name="sift") as process, connected_client() as client:
+        query = room_queries[0]
+        client.send_camera_info(info_of(room_camera))
+        client.send_prior(prior_of(query.T_map_camera_prior))
+        assert client.attempt(rgb_image(query.image)).ok
+        requests = [client.send_request() for _ in range(3)]
+        client.spin(0.2)
+        assert_clean_end(process, signal.SIGTERM)
+        assert client.spin_until(lambda: all(request.done() for request in requests), 5.0), (process.output, [r.done() for r in requests])
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("delay", [0.6, 1.5, 3.0])
+def test_signal_during_the_start_ends_it_cleanly(room_map_file, number, delay):
+    process = NodeProcess(*node_arguments(map__path=room_map_file, matcher__name="sift"))
+    try:
+        time.sleep(delay)
+        assert_clean_end(process, number)
+    finally:
+        process.end()
+
+
+def assert_clean_end(process: NodeProcess, number: signal.Signals, timeout: float = 20.0) -> None:
+    process.signal(number)
+    assert process.wait(timeout) == 0, process.output
+    assert "Traceback" not in process.output
+
+
+@pytest.mark.parametrize(
+    ("parameters", "says"),
+    [
+        ({}, "map.path is empty"),
+        ({"map__path": "/nowhere/room.ply"}, "/nowhere/room.ply"),
+        ({"map__path": executable()}, "localizer"),
+        ({"matcher__name": "orb", "map__path": "ROOM"}, "'orb' is not one of"),
+        ({"renderer__device": "abacus", "map__path": "ROOM"}, "'abacus' is not one of"),
+        ({"localizer__max_passes": 0, "map__path": "ROOM"}, "localizer.max_passes"),
+        ({"localizer__max_reprojection_error": 3, "map__path": "ROOM"}, "expecting type 'DOUBLE'"),
+    ],
+)
+def test_start_that_cannot_be_says_why_in_one_line(room_map_file, parameters, says):
+    values = {name: room_map_file if value == "ROOM" else value for name, value in parameters.items()}
+    process = NodeProcess(*node_arguments(**values))
+    try:
+        assert process.wait(TIMEOUT) == 1
+        lines = process.output.strip().splitlines()
+        assert len(lines) == 1, process.output
+        assert says in lines[0]
+        assert "[FATAL]" in lines[0]
+    finally:
+        process.end()
