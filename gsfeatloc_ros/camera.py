@@ -21,7 +21,8 @@ class Camera:
     Attributes:
         width, height: image size in pixels.
         K: (3, 3) float64 intrinsic matrix in pixels.
-        distortion: (n,) float64 coefficients in OpenCV's order for `model`; empty or all zero means none.
+        distortion: (n,) float64 coefficients in OpenCV's order for `model`; empty or all zero means none (for the
+            equidistant model: an ideal fisheye).
         model: "plumb_bob", "rational_polynomial" or "equidistant" (fisheye), as in sensor_msgs/CameraInfo.
 
     Raises:
@@ -77,14 +78,16 @@ class Camera:
     def undistort(self, pixels: np.ndarray) -> np.ndarray:
         """Move observed pixels (N, 2) to where a pinhole camera with the same K would see them: (N, 2) float64."""
         pixels = np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
-        if len(pixels) == 0 or not self.distortion.any():
+        fisheye = self.model == "equidistant"  # even without coefficients no pinhole
+        if len(pixels) == 0 or not (fisheye or self.distortion.any()):
             return pixels.copy()
         points = pixels.reshape(-1, 1, 2)
-        if self.model == "equidistant":
-            undistorted = cv2.fisheye.undistortPoints(points, self.K, self.distortion, P=self.K)
+        if fisheye:
+            coefficients = self.distortion if len(self.distortion) else np.zeros(4)
+            undistorted = cv2.fisheye.undistortPoints(points, self.K, coefficients, P=self.K)
         else:
             criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-10)
-            undistorted = cv2.undistortPointsIter(points, self.K, self.distortion, None, self.K, criteria)
+            undistorted = cv2.undistortImagePoints(points, self.K, self.distortion, None, criteria)
         return undistorted.reshape(-1, 2)
 
     def project(self, points: np.ndarray) -> np.ndarray:

@@ -23,10 +23,10 @@ DEPTH_MIN_ALPHA = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Render:
-    """What a camera at one pose would see of the map, on a black background.
+    """What a camera at one pose would see of the map.
 
     Attributes:
-        rgb: (H, W, 3) float32 in [0, 1].
+        rgb: (H, W, 3) float32 in [0, 1], on the renderer's background.
         depth: (H, W) float32, alpha-weighted mean z-depth in map units; NaN where alpha < DEPTH_MIN_ALPHA.
         median_depth: (H, W) float32, z-depth in map units of the Gaussian at which the transmittance falls to a half;
             floaters that cover less than that do not move it, as they do the mean; NaN where depth is.

@@ -52,7 +52,12 @@ class Trace:
 
 
 class Room:
-    """A furnished room of 6 x 5 x 3 metres, z up, the floor at z = 0. Its textures depend on the seed."""
+    """A furnished room of 6 x 5 x 3 metres, z up, the floor at z = 0. Its textures depend on the seed.
+
+    Attributes:
+        solids: the walls, seen from inside, and then the furniture.
+        pictures: those (rows, cols, 3) uint8 RGB on the six faces of each solid; rows run along v, columns along u.
+    """
 
     def __init__(self, seed: int = 0) -> None:
         rng = np.random.default_rng(seed)
@@ -105,10 +110,12 @@ class Room:
             closer = t < depth[candidates]
             depth[candidates[closer]], hit[candidates[closer]] = t[closer], index
         points = origin.astype(np.float32) + depth[:, None] * directions
-        return self._colours(points, hit).reshape(height, width, -1, 3)[:, :, 0], depth.reshape(height, width)
+        texels = self._texels(points, hit).reshape(height, width, 2)
+        colours = cv2.remap(self._atlas, texels, None, cv2.INTER_LINEAR)
+        return colours.astype(np.float32) / 255, depth.reshape(height, width)
 
-    def _colours(self, points: np.ndarray, hit: np.ndarray) -> np.ndarray:
-        """Colours (N, 3) of surface points (N, 3) of the solids `hit` (N,)."""
+    def _texels(self, points: np.ndarray, hit: np.ndarray) -> np.ndarray:
+        """Where in the atlas (N, 2) the surface points (N, 3) of the solids `hit` (N,) are."""
         texels = np.empty((len(points), 2), np.float32)
         for index, solid in enumerate(self.solids):
             rows = np.flatnonzero(hit == index)
@@ -117,12 +124,7 @@ class Room:
             # Clipped to the face, so that interpolation does not mix in the picture of another.
             texels[rows] = np.clip((uv + 1) / 2 * extents - 0.5, 0, extents - 1)
             texels[rows, 1] += self._tops[index, faces]
-        # OpenCV takes images of less than 32768 rows and columns.
-        columns = 1024
-        padded = np.zeros((-(-len(texels) // columns) * columns, 2), np.float32)
-        padded[: len(texels)] = texels
-        colours = cv2.remap(self._atlas, padded.reshape(-1, columns, 2), None, cv2.INTER_LINEAR)
-        return colours.reshape(-1, 3)[: len(texels)].astype(np.float32) / 255
+        return texels
 
 
 def pixel_rays(camera: Camera, offset: tuple[float, float] = (0.0, 0.0)) -> np.ndarray:
