@@ -49,7 +49,7 @@ install_torch() {
             || fail "no $cpu_torch for $(.venv/bin/python -V) at pip's indexes nor at $cpu_torch_index. Nothing else is taken: PyPI's torch brings gigabytes of CUDA."
     fi
     # Keeps the installations below from replacing it.
-    .venv/bin/python -c 'import torch; print(f"torch=={torch.__version__}")' >>.venv/constraints.txt
+    .venv/bin/python -c 'from importlib.metadata import version; print("torch==" + version("torch"))' >>.venv/constraints.txt
 }
 
 has_gpu() { nvidia-smi -L >/dev/null 2>&1; }

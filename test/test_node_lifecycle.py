@@ -43,7 +43,7 @@ def test_signal_while_busy_answers_the_requests_first(room_map_file, room_camera
         requests = [client.send_request() for _ in range(3)]
         client.spin(0.2)
         assert_clean_end(process, signal.SIGTERM)
-        assert client.spin_until(lambda: all(request.done() for request in requests), 5.0), (process.output, [r.done() for r in requests])
+        assert client.spin_until(lambda: all(request.done() for request in requests), 5.0)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -10,9 +10,9 @@ import time
 from collections.abc import Callable
 from types import FrameType
 
-# How long the running localization may take to end after a signal, and requests to be answered, in seconds.
+# Seconds that the running localization gets to end after a signal, and requests in progress to be answered.
 _STOP_TIMEOUT = 3.0
-_ANSWER_TIMEOUT = 0.5
+_ANSWER_TIME = 0.5
 # How often spinning looks for a signal, in seconds.
 _SIGNAL_PERIOD = 0.1
 
@@ -47,9 +47,11 @@ def main(args: list[str] | None = None) -> int:
         # The thread is in native code that the interpreter's own exit would pull away under it.
         sys.stderr.flush()
         os._exit(0)
-    deadline = time.monotonic() + _ANSWER_TIMEOUT
-    while node.unanswered_requests and time.monotonic() < deadline:
-        executor.spin_once(timeout_sec=_SIGNAL_PERIOD)
+    if node.unanswered_requests:
+        # A service cannot wait for acknowledgements: the answers get this long to be sent and to arrive.
+        deadline = time.monotonic() + _ANSWER_TIME
+        while time.monotonic() < deadline:
+            executor.spin_once(timeout_sec=_SIGNAL_PERIOD)
     node.destroy_node()
     rclpy.shutdown()
     return 0
