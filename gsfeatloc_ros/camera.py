@@ -75,20 +75,35 @@ class Camera:
             return self
         return self.scaled(max_width, max(1, round(self.height * max_width / self.width)))
 
+    @property
+    def distorted(self) -> bool:
+        """Whether the lens is anything but a pinhole; a fisheye without coefficients is."""
+        return self.model == "equidistant" or bool(self.distortion.any())
+
     def undistort(self, pixels: np.ndarray) -> np.ndarray:
         """Move observed pixels (N, 2) to where a pinhole camera with the same K would see them: (N, 2) float64."""
         pixels = np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
-        fisheye = self.model == "equidistant"  # even without coefficients no pinhole
-        if len(pixels) == 0 or not (fisheye or self.distortion.any()):
+        if len(pixels) == 0 or not self.distorted:
             return pixels.copy()
         points = pixels.reshape(-1, 1, 2)
-        if fisheye:
-            coefficients = self.distortion if len(self.distortion) else np.zeros(4)
-            undistorted = cv2.fisheye.undistortPoints(points, self.K, coefficients, P=self.K)
+        if self.model == "equidistant":
+            undistorted = cv2.fisheye.undistortPoints(points, self.K, self._fisheye_coefficients, P=self.K)
         else:
             criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-10)
             undistorted = cv2.undistortImagePoints(points, self.K, self.distortion, None, criteria)
         return undistorted.reshape(-1, 2)
+
+    def undistort_image(self, image: np.ndarray) -> np.ndarray:
+        """The image (H, W, C) that a pinhole camera with the same K would take; black where the lens saw nothing."""
+        if not self.distorted:
+            return image
+        if self.model == "equidistant":
+            return cv2.fisheye.undistortImage(image, self.K, self._fisheye_coefficients, Knew=self.K)
+        return cv2.undistort(image, self.K, self.distortion)
+
+    @property
+    def _fisheye_coefficients(self) -> np.ndarray:
+        return self.distortion if len(self.distortion) else np.zeros(4)
 
     def project(self, points: np.ndarray) -> np.ndarray:
         """Pinhole pixels (N, 2), without distortion, of camera-frame points (N, 3) with z > 0."""

@@ -15,6 +15,7 @@ class Status(Enum):
     """Whether the pose of an Estimate may be used."""
 
     LOCALIZED = "localized"
+    REJECTED = "rejected"
     FAILED = "failed"
 
 
@@ -23,15 +24,19 @@ class Estimate:
     """Where a photo was taken, or why that could not be said.
 
     Attributes:
-        status: LOCALIZED: the pose is an answer. FAILED: there is none; the prior is never passed off as one.
+        status: LOCALIZED: the pose is an answer. REJECTED: a pose was found, but the map seen from there does not match
+            the photo. FAILED: no pose was found. Neither has an answer; the prior is never passed off as one.
         reason: one sentence in words, for a log or a diagnostic.
-        T_map_camera: (4, 4) float64 pose of the camera (optical axes) in the map frame; None when FAILED.
+        T_map_camera: (4, 4) float64 pose of the camera (optical axes) in the map frame; None unless LOCALIZED.
         covariance: (6, 6) float64 in ROS order (x y z, rotation about x y z), translation in map units, rotation in
-            radians, both about the axes of the map frame at the camera centre; None when FAILED.
+            radians, both about the axes of the map frame at the camera centre; None unless LOCALIZED.
         matches: number of 2D-2D matches of the final pass.
         inliers: number of 2D-3D matches that agree with the pose.
-        reprojection_error: RMS of the inliers' reprojection errors in pixels of the localized image; NaN when FAILED.
-        passes: number of renders that were matched.
+        coverage: share of the photo's cells, in a grid of 8 x 6, that hold an inlier.
+        agreement: correlation of photo and render at the estimate (pose/acceptance.py); NaN where it cannot be said.
+        reprojection_error: RMS of the inliers' reprojection errors in pixels of the localized image; NaN without pose.
+        passes: number of renders that were matched at the prior and the estimates.
+        views: number of other views that were searched.
         milliseconds: wall time of each stage by name, with "total".
         correspondences: pixels of the inliers (photo, last render), photo pixels as observed (distorted).
         last_render: the last render that was matched, for pictures.
@@ -43,8 +48,11 @@ class Estimate:
     covariance: np.ndarray | None = None
     matches: int = 0
     inliers: int = 0
+    coverage: float = 0.0
+    agreement: float = float("nan")
     reprojection_error: float = float("nan")
     passes: int = 0
+    views: int = 0
     milliseconds: dict[str, float] = field(default_factory=dict)
     correspondences: Matches | None = None
     last_render: Render | None = None

@@ -47,7 +47,9 @@ def test_the_answer_carries_its_evidence(sift_localizer, room_camera, room_queri
     assert len(estimate.correspondences) == estimate.inliers
     assert 0 < estimate.reprojection_error < 3.0
     assert 2 <= estimate.passes <= 3
-    assert {"features", "render", "match", "solve", "total"} <= estimate.milliseconds.keys()
+    assert 0.5 < estimate.agreement <= 1.0
+    assert 0.5 < estimate.coverage <= 1.0
+    assert {"features", "render", "match", "solve", "judge", "total"} <= estimate.milliseconds.keys()
     stages = sum(ms for stage, ms in estimate.milliseconds.items() if stage != "total")
     assert stages <= estimate.milliseconds["total"]
 
@@ -68,7 +70,7 @@ def test_wide_photos_are_resized(renderer, room_camera, room_queries) -> None:
 
 
 def assert_no_answer(estimate) -> None:
-    assert estimate.status is Status.FAILED
+    assert estimate.status in (Status.FAILED, Status.REJECTED)
     assert not estimate.localized
     assert estimate.T_map_camera is None
     assert estimate.covariance is None
@@ -88,22 +90,43 @@ def test_a_prior_that_sees_nothing_is_a_failure(localizer, room_camera, room_que
     assert_no_answer(localizer.localize(room_queries[0].image, room_camera, outside))
 
 
-def test_photos_of_something_else_are_failures(localizer, room_camera, room_queries) -> None:
-    rng = np.random.default_rng(0)
+def test_noise_is_no_place(localizer, room_camera, room_queries) -> None:
+    noise = np.random.default_rng(0).integers(0, 256, room_queries[0].image.shape, dtype=np.uint8)
+    assert_no_answer(localizer.localize(noise, room_camera, room_queries[0].T_map_camera))
+
+
+def test_mirrored_photos_are_rejected(localizer, room_camera, room_queries) -> None:
+    """Seen from behind, through the wall, the room is mirrored: poses there match well, but are far from the prior."""
+    for query in room_queries[:2]:
+        mirrored = np.ascontiguousarray(query.image[:, ::-1])
+        assert_no_answer(localizer.localize(mirrored, room_camera, query.T_map_camera))
+
+
+def test_an_answer_far_from_the_prior_is_rejected(sift_localizer, room_camera, room_queries) -> None:
+    """The prior is 0.3 m and 10 degrees off at least, and says that it knows better."""
     query = room_queries[0]
-    noise = rng.integers(0, 256, query.image.shape, dtype=np.uint8)
-    mirrored = np.ascontiguousarray(query.image[:, ::-1])
-    for photo in (noise, mirrored):
-        assert_no_answer(localizer.localize(photo, room_camera, query.T_map_camera))
+    sure = np.diag([1e-6] * 6)
+    estimate = sift_localizer.localize(query.image, room_camera, query.T_map_camera_prior, sure)
+    assert estimate.status is Status.REJECTED
+    assert "standard deviations from the prior" in estimate.reason
 
 
 def test_the_render_at_the_estimate_is_the_judge(renderer, room_camera, room_queries) -> None:
-    """More inliers asked for than there are: a failure, at the estimate, and not the estimate."""
-    demanding = Localizer(renderer, create_matcher("sift"), LocalizerOptions(min_inliers=100_000))
-    estimate = demanding.localize(room_queries[0].image, room_camera, room_queries[0].T_map_camera_prior)
-    assert_no_answer(estimate)
-    assert "at the estimate" in estimate.reason
-    assert estimate.passes > 1
+    """What it is asked for and does not have is said; the pose is kept back."""
+    query = room_queries[0]
+    demands = {
+        "min_inliers": (100_000, "at least 100000 needed"),
+        "min_inlier_ratio": (1.0, "inliers"),
+        "min_coverage": (1.1, "of the photo"),
+        "min_agreement": (1.1, "correlation"),
+    }
+    for option, (value, says) in demands.items():
+        demanding = Localizer(renderer, create_matcher("sift"), LocalizerOptions(max_views=0, **{option: value}))
+        estimate = demanding.localize(query.image, room_camera, query.T_map_camera_prior)
+        assert estimate.status is Status.REJECTED
+        assert_no_answer(estimate)
+        assert says in estimate.reason
+        assert estimate.passes > 1
 
 
 def test_distortion_is_taken_out(sift_localizer, room_camera, room_queries) -> None:

@@ -22,9 +22,9 @@ from std_srvs.srv import Trigger
 
 from gsfeatloc_ros.camera import Camera
 from gsfeatloc_ros.estimate import Estimate
-from gsfeatloc_ros.localize import Localizer
+from gsfeatloc_ros.localize import Localizer, LocalizerOptions
 from gsfeatloc_ros.maps import load_map
-from gsfeatloc_ros.match import create_matcher
+from gsfeatloc_ros.match import Matcher, create_matcher
 from gsfeatloc_ros.node.diagnostics import ERROR, OK, WARN, diagnostic_message, evidence, stamp_text
 from gsfeatloc_ros.node.messages import (
     decode_camera,
@@ -96,7 +96,7 @@ class LocalizerNode(Node):
         self._renderer = create_renderer(gaussian_map, values["renderer.device"], values["renderer.threads"])
         matcher = create_matcher(values["matcher.name"], values["matcher.weights"], values["matcher.max_features"])
         self._localizer = Localizer(self._renderer, matcher, self._options)
-        self._warm_up()
+        self._warm_up(matcher)
 
         self._worker = LatestWorker(self._attempt)
         self._images_received = 0
@@ -138,11 +138,11 @@ class LocalizerNode(Node):
         """Number of relocalize requests in progress."""
         return self._unanswered_requests
 
-    def _warm_up(self) -> None:
+    def _warm_up(self, matcher: Matcher) -> None:
         """Compile the kernels and load the networks now, not at the first image."""
         camera = Camera(320, 240, np.array([[300.0, 0, 159.5], [0, 300.0, 119.5], [0, 0, 1]]))
         noise = np.random.default_rng(0).integers(0, 256, (camera.height, camera.width, 3), dtype=np.uint8)
-        self._localizer.localize(noise, camera, np.eye(4))
+        Localizer(self._renderer, matcher, LocalizerOptions(max_views=1)).localize(noise, camera, np.eye(4))
 
     # Callbacks, in the executor's thread.
 

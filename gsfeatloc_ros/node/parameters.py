@@ -56,12 +56,30 @@ PARAMETERS = (
     Parameter("renderer.threads", 0, "Threads of the CPU renderer; 0 takes all cores.", (0, 1024)),
     _option("max_image_width", "Wider images are resized to this many pixels first.", (64, 16384)),
     _option("max_passes", "Most renders matched for one image: one at the prior, the others at estimates.", (1, 20)),
-    _option("min_inliers", "With fewer 2D-3D matches that agree on a pose there is no answer.", (4, 100000)),
-    _option("min_inlier_ratio", "With a smaller share of inliers among the matches there is no answer.", (0.0, 1.0)),
     _option(
         "max_reprojection_error", "Pixels of the resized image within which a match agrees with a pose.", (0.1, 50.0)
     ),
-    _option("seed", "Seed of RANSAC: the same seed gives the same answer.", (0, 2**31 - 1)),
+    _option("min_inliers", "With fewer 2D-3D matches that agree on a pose there is no answer.", (4, 100000)),
+    _option("min_inlier_ratio", "With a smaller share of inliers among the matches there is no answer.", (0.0, 1.0)),
+    _option(
+        "min_coverage", "With inliers in a smaller share of the image's 8 x 6 cells there is no answer.", (0.0, 1.0)
+    ),
+    _option(
+        "min_agreement",
+        "With a smaller correlation of image and render at the estimate there is no answer.",
+        (-1.0, 1.0),
+    ),
+    _option(
+        "max_deviation",
+        "Farther than this many standard deviations from the prior there is no answer.",
+        (0.1, 1e6),
+    ),
+    _option(
+        "max_views", "Most other views searched when the prior's shows nothing of the image; 0 for none.", (0, 1000)
+    ),
+    _option("prior_rotation", "Standard deviation of the prior in degrees about each axis.", (0.01, 180.0)),
+    _option("prior_translation", "Standard deviation of the prior in map units along each axis.", (1e-6, 1e6)),
+    _option("seed", "Seed of RANSAC and of the search: the same seed gives the same answer.", (0, 2**31 - 1)),
 )
 
 

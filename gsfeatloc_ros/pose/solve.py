@@ -19,8 +19,11 @@ MIN_POINTS = 4
 # Keypoints are no better than this, however well a few of them happen to agree.
 _MIN_PIXEL_SIGMA = 0.1
 _REFINE_ITERATIONS = 20
-# In standard deviations. RANSAC has removed the gross outliers: a narrower loss would waste good matches.
-_CAUCHY_SCALE = 2.4
+# In standard deviations. Real residuals have longer tails than a Gaussian's, so the loss is narrow.
+_CAUCHY_SCALE = 1.0
+# What matches have in common (errors of the map, of its poses, of the calibration) does not average out over them: an
+# error of this many pixels that all share. Fitted on real photos; docs/trust.md.
+_SHARED_PIXEL_SIGMA = 0.1
 _NOISE_ITERATIONS = 5
 _CONVERGED = 1e-10
 
@@ -118,7 +121,8 @@ def refine_pose(
     Args and shapes as for `solve_pose`; `T_map_camera` is where to start.
 
     Returns:
-        The refined pose (4, 4) and its covariance (6, 6): the inverse of the Hessian, inflated by the residuals' scale.
+        The refined pose (4, 4) and its covariance (6, 6): the inverse of the Hessian, inflated by the
+        residuals' scale, and the share of errors that the matches have in common.
         (None, None) where a point falls behind the camera or the matches do not determine the pose.
     """
     pose = T_map_camera
@@ -160,7 +164,9 @@ def refine_pose(
     weights = _cauchy_weights(squared)
     degrees_of_freedom = max(2 * weights.sum() - 6, 1.0)
     inflation = max((weights * squared).sum() / degrees_of_freedom, 1.0)
-    return pose, covariance * inflation
+    information_of_a_match = np.einsum("m,mri,mrj->ij", weights, jacobian, jacobian) / weights.sum()
+    shared = _SHARED_PIXEL_SIGMA**2 * np.linalg.inv(information_of_a_match)
+    return pose, covariance * inflation + shared
 
 
 def _linearize(camera: Camera, pose: np.ndarray, pixels: np.ndarray, points: np.ndarray):

@@ -1,0 +1,83 @@
+"""Where to look when the map seen from the prior has nothing in common with the photo."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from gsfeatloc_ros.camera import Camera
+from gsfeatloc_ros.geometry import make_pose, so3_exp
+from gsfeatloc_ros.match.base import Matcher
+from gsfeatloc_ros.render.base import Renderer
+from gsfeatloc_ros.timing import StageClock
+from gsfeatloc_ros.view import match_view
+
+# Matches that agree on a pose, by which a view suggests it. The render at that pose then is the judge.
+MIN_HINT = 8
+# Views are compared with the photo at this width, which is cheap and enough to tell which is worth more.
+_WIDTH = 320
+# Of the views that are looked at together, the best of this many are followed.
+_FOLLOWED = 2
+# Views are chosen from this many random ones for each that is looked at.
+_DRAWN = 16
+# Nothing is searched farther out than this, in standard deviations of all six coordinates together: 90 % lie within.
+_REACH = 3.26
+
+
+def promising_poses(
+    renderer: Renderer,
+    matcher: Matcher,
+    image: np.ndarray,
+    camera: Camera,
+    poses: list[np.ndarray],
+    max_error: float,
+    seed: int,
+    clock: StageClock,
+) -> list[np.ndarray]:
+    """Look at the map from `poses`, in small renders, and say what poses (4, 4) of the photo that suggests, best first.
+
+    Args:
+        renderer, matcher: of the map and of features.
+        image: (H, W, 3) uint8 RGB, as observed by `camera`.
+        poses: (4, 4) each, T_map_camera of the views.
+        max_error: reprojection error in pixels of the small image up to which a match agrees with a pose.
+        seed: of RANSAC.
+        clock: on which the stages of the views are counted.
+    """
+    camera = camera.limited(_WIDTH)
+    with clock.stage("features"):
+        query = matcher.features(cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA))
+    views = [match_view(renderer, matcher, query, camera, pose, max_error, seed, clock) for pose in poses]
+    hints = [view for view in views if view.inliers >= MIN_HINT]
+    hints.sort(key=lambda view: view.inliers, reverse=True)
+    return [view.solution.T_map_camera for view in hints[:_FOLLOWED]]
+
+
+def spread_poses(T_map_camera: np.ndarray, covariance: np.ndarray, count: int, seed: int) -> list[np.ndarray]:
+    """Choose `count` poses (4, 4) spread over the uncertainty (6, 6) of a pose, the likely ones first.
+
+    Farthest-point sampling (Gonzalez, 1985) among random poses, in units of the standard deviation: no two look at
+    nearly the same thing, and none at what the pose itself has shown.
+
+    Args:
+        T_map_camera: (4, 4).
+        covariance: (6, 6), ROS order (x y z, rotation about x y z), axes of the map frame, map units and radians.
+        count: number of poses.
+        seed: the same seed gives the same poses.
+    """
+    rng = np.random.default_rng(seed)
+    normal = rng.normal(size=(_DRAWN * count, 6))
+    normal = normal[np.linalg.norm(normal, axis=1) <= _REACH]
+    values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
+    root = vectors * np.sqrt(np.clip(values, 0.0, None))
+    distance = np.linalg.norm(normal, axis=1)
+    chosen = []
+    for _ in range(min(count, len(normal))):
+        farthest = int(distance.argmax())
+        chosen.append(normal[farthest])
+        distance = np.minimum(distance, np.linalg.norm(normal - normal[farthest], axis=1))
+    chosen.sort(key=np.linalg.norm)
+    return [
+        make_pose(so3_exp((root @ step)[3:]) @ T_map_camera[:3, :3], T_map_camera[:3, 3] + (root @ step)[:3])
+        for step in chosen
+    ]
