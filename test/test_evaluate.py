@@ -1,9 +1,9 @@
-"""Scenes, priors, the published recipe, the measures and the command."""
+"""Priors, the published recipe and the measures."""
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, fields, replace
+from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from hypothesis import given
@@ -11,170 +11,52 @@ from hypothesis import strategies as st
 
 from gsfeatloc_ros.camera import Camera
 from gsfeatloc_ros.estimate import Estimate, Status
-from gsfeatloc_ros.evaluate.metrics import measure, summarize
-from gsfeatloc_ros.evaluate.protocol import PriorError, make_priors, paper_prior_error, perturb, trajectory_radius
+from gsfeatloc_ros.evaluate.dataset import Photo, Scene
+from gsfeatloc_ros.evaluate.metrics import (
+    QueryResult,
+    best_of,
+    by_step,
+    chi_square_cdf,
+    measure,
+    normalised_error,
+    summarize,
+)
+from gsfeatloc_ros.evaluate.priors_file import read_priors
+from gsfeatloc_ros.evaluate.protocol import (
+    PROTOCOLS,
+    PriorError,
+    make_priors,
+    paper_bounds,
+    paper_prior_error,
+    perturb,
+    trajectory_radius,
+)
 from gsfeatloc_ros.evaluate.published import PublishedLocalizer
 from gsfeatloc_ros.evaluate.scene import load_scene
-from gsfeatloc_ros.geometry import invert, make_pose, rotation_error_deg, so3_exp, so3_log, translation_error
-from gsfeatloc_ros.maps import load_map
+from gsfeatloc_ros.geometry import (
+    invert,
+    make_pose,
+    quaternion_from_matrix,
+    random_unit_vector,
+    rotation_error_deg,
+    so3_exp,
+    so3_log,
+    translation_error,
+)
 from gsfeatloc_ros.match import Features, Matches
-from gsfeatloc_ros.render import Render, create_renderer
-from gsfeatloc_ros.tools.evaluate import main
+from gsfeatloc_ros.render import Render
 
-# Scenes
+CAMERA = Camera(320, 240, np.array([[300.0, 0, 160], [0, 300.0, 120], [0, 0, 1]]))
+PRIOR = make_pose(so3_exp(np.array([0.3, -1.2, 0.8])), np.array([5.0, -3.0, 2.0]))
 
 
 @pytest.fixture
-def transforms():
-    """transforms.json of two frames, 8x6 pixels: one at the origin as OpenGL sees it, one a step to the right."""
-    step = np.eye(4)
-    step[0, 3] = 1.0
-    return {
-        "fl_x": 10.0,
-        "fl_y": 11.0,
-        "cx": 4.0,
-        "cy": 3.0,
-        "w": 8,
-        "h": 6,
-        "frames": [
-            {"file_path": "images/a.png", "transform_matrix": np.eye(4).tolist()},
-            {"file_path": "images/b.png", "transform_matrix": step.tolist()},
-        ],
-        "train_filenames": ["images/a.png"],
-        "test_filenames": ["images/b.png"],
-    }
-
-
-def save_scene(folder, transforms, photo=None):
-    """Write transforms.json and the test photo, RGB(A)."""
-    (folder / "images").mkdir()
-    photo = np.full((6, 8, 3), 7, np.uint8) if photo is None else photo
-    to_bgr = cv2.COLOR_RGBA2BGRA if photo.shape[2] == 4 else cv2.COLOR_RGB2BGR
-    cv2.imwrite(str(folder / "images/b.png"), cv2.cvtColor(photo, to_bgr))
-    (folder / "transforms.json").write_text(json.dumps(transforms), encoding="utf-8")
-    return folder
-
-
-def test_scene_is_read_into_our_conventions(tmp_path, transforms):
-    scene = load_scene(save_scene(tmp_path, transforms))
-    # The middle of an image 8 wide is at 4 where the top-left pixel's centre is at 0.5, at 3.5 where it is at 0.
-    np.testing.assert_array_equal(scene.camera.K, [[10, 0, 3.5], [0, 11, 2.5], [0, 0, 1]])
-    # OpenGL looks along -z with y up; we look along z with y down.
-    expected = [[1, 0, 0, 1], [0, -1, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]]
-    np.testing.assert_array_equal(scene.photos[0].T_map_camera, expected)
-    assert [photo.path.name for photo in scene.photos] == ["b.png"]
-    assert scene.trajectory.shape == (2, 4, 4)
-    assert trajectory_radius(scene) == pytest.approx(0.5)
-    assert scene.background == (0.0, 0.0, 0.0)
-
-
-def test_distortion_is_kept(tmp_path, transforms):
-    scene = load_scene(save_scene(tmp_path, transforms | {"k1": 0.1, "k2": 0.2, "p1": 0.3, "p2": 0.4}))
-    np.testing.assert_array_equal(scene.camera.distortion[:4], [0.1, 0.2, 0.3, 0.4])
-
-
-def test_photo_colours(tmp_path, transforms):
-    pixels = np.random.default_rng(0).integers(0, 256, (6, 8, 3), dtype=np.uint8)
-    scene = load_scene(save_scene(tmp_path, transforms, pixels))
-    np.testing.assert_array_equal(scene.read_photo(scene.photos[0]), pixels)
-
-
-def test_photo_with_alpha_lies_on_white(tmp_path, transforms):
-    pixels = np.zeros((6, 8, 4), np.uint8)
-    pixels[0, 0] = [200, 100, 0, 255]
-    pixels[0, 1] = [200, 100, 0, 51]
-    scene = load_scene(save_scene(tmp_path, transforms, pixels))
-    photo = scene.read_photo(scene.photos[0])
-    assert scene.background == (1.0, 1.0, 1.0)
-    assert photo[0, 0].tolist() == [200, 100, 0]
-    assert photo[0, 1].tolist() == [244, 224, 204]  # a fifth of the colour, four fifths of white
-    assert photo[5, 7].tolist() == [255, 255, 255]
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"fl_x": None}, "transforms.json"),
-        ({"fl_x": 0.0}, "focal"),
-        ({"w": 0}, "size"),
-        ({"camera_model": "OPENCV_FISHEYE"}, "OPENCV_FISHEYE"),
-        ({"test_filenames": []}, "test_filenames is empty"),
-        ({"test_filenames": ["images/c.png"]}, "1 test photos have no frame, the first is images/c.png"),
-        ({"test_filenames": ["images/a.png"]}, r"1 of 1 test photos are missing, the first is a\.png"),
-        ({"frames": [{"file_path": "images/b.png", "transform_matrix": [1, 2]}]}, r"images/b\.png"),
-        ({"frames": [{"file_path": "images/b.png", "transform_matrix": np.ones((4, 4)).tolist()}]}, "rigid"),
-        ({"frames": [{"file_path": "images/b.png", "transform_matrix": np.diag([1, 1, -1, 1]).tolist()}]}, "rigid"),
-        ({"frames": [{"file_path": "images/b.png", "transform_matrix": [[float("nan")] * 4] * 4}]}, "finite"),
-        ({"frames": [{"file_path": "images/b.png"}]}, "transform_matrix"),
-    ],
-)
-def test_scene_that_cannot_be_used(tmp_path, transforms, change, message):
-    with pytest.raises(ValueError, match=message):
-        load_scene(save_scene(tmp_path, transforms | change))
-
-
-@pytest.mark.parametrize("key", ["fl_x", "cy", "w", "frames", "test_filenames"])
-def test_missing_key_is_named(tmp_path, transforms, key):
-    del transforms[key]
-    with pytest.raises(ValueError, match=f"lacks the key '{key}'"):
-        load_scene(save_scene(tmp_path, transforms))
-
-
-@pytest.mark.parametrize("content", ["", "{", "[]", "3", '"text"'])
-def test_transforms_that_are_not_an_object(tmp_path, content):
-    (tmp_path / "transforms.json").write_text(content)
-    with pytest.raises(ValueError, match=r"transforms\.json"):
-        load_scene(tmp_path)
-
-
-def test_no_transforms(tmp_path):
-    with pytest.raises(ValueError, match=r"transforms\.json: cannot be read: No such file"):
-        load_scene(tmp_path)
-
-
-def test_photo_of_another_size(tmp_path, transforms):
-    scene = load_scene(save_scene(tmp_path, transforms, np.zeros((3, 4, 3), np.uint8)))
-    with pytest.raises(ValueError, match=r"4x3.*8x6"):
-        scene.read_photo(scene.photos[0])
-
-
-def test_photo_that_is_not_an_image(tmp_path, transforms):
-    save_scene(tmp_path, transforms)
-    (tmp_path / "images/b.png").write_bytes(b"not a picture")
-    with pytest.raises(ValueError, match=r"b\.png: is not an image"):
-        load_scene(tmp_path)
-
-
-@pytest.mark.parametrize(
-    ("name", "photos", "frames", "background"),
-    [("bonsai", 37, 292, (0.0, 0.0, 0.0)), ("lego", 50, 150, (1.0, 1.0, 1.0))],
-)
-def test_real_scenes(shared, name, photos, frames, background):
-    scene = load_scene(shared / "scenes" / name)
-    assert len(scene.photos) == photos
-    assert len(scene.trajectory) == frames
-    assert scene.background == background
-    for photo in scene.photos:
-        assert scene.read_photo(photo).shape == (scene.camera.height, scene.camera.width, 3)
-
-
-@pytest.mark.parametrize("name", ["bonsai", "lego"])
-def test_photos_and_renders_lie_on_each_other_to_the_half_pixel(shared, name):
-    scene = load_scene(shared / "scenes" / name)
-    renderer = create_renderer(load_map(scene.map_path), background=scene.background)
-    width, height = scene.camera.width // 2, scene.camera.height // 2
-    photos = [(p, cv2.resize(scene.read_photo(p), (width, height), interpolation=cv2.INTER_AREA)) for p in scene.photos]
-
-    def psnr(shift):
-        K = scene.camera.K.copy()
-        K[:2, 2] += shift
-        camera = replace(scene.camera, K=K).scaled(width, height)
-        return np.mean([cv2.PSNR(image, renderer.render(camera, p.T_map_camera).image()) for p, image in photos[:6]])
-
-    right = psnr([0, 0])
-    assert right > 25
-    for shift in ([0.5, 0], [-0.5, 0], [0, 0.5], [0, -0.5]):
-        assert right > psnr(shift)
+def scene():
+    """Three photos on a circle of radius 2 that looks about, and a fourth pose on it."""
+    angles = [0.0, 1.0, 2.0, 3.0]
+    poses = [make_pose(so3_exp(np.array([0.2, a, 0.1 * a])), 2 * np.array([np.cos(a), 0, np.sin(a)])) for a in angles]
+    photos = tuple(Photo(f"{i}.5.png", Path(f"{i}.5.png"), CAMERA, pose) for i, pose in enumerate(poses[:3]))
+    return Scene("circle", Path("map.ply"), photos, np.array(poses), (0.0, 0.0, 0.0))
 
 
 # Priors
@@ -226,16 +108,154 @@ def test_no_error_gives_the_truth():
     np.testing.assert_allclose(perturb(T_true, PriorError(0.0, 0.0), np.random.default_rng(0)), T_true, atol=1e-12)
 
 
-def test_priors_depend_on_the_seed_and_the_photo_alone(tmp_path, transforms):
-    frame = transforms["frames"][1]
-    transforms["frames"] = [frame | {"file_path": f"images/{name}.png"} for name in "bcd"]
-    transforms["test_filenames"] = ["images/b.png"] * 3
-    scene = load_scene(save_scene(tmp_path, transforms))
-    priors = make_priors(scene, PriorError(0.2, 0.5), seed=3)
-    fewer = make_priors(replace(scene, photos=scene.photos[:2]), PriorError(0.2, 0.5), seed=3)
+def test_priors_depend_on_the_seed_and_the_photo_alone(scene):
+    same = replace(scene, photos=scene.photos[:1] * 3)
+    priors = make_priors(same, PriorError(0.2, 0.5), seed=3)
+    fewer = make_priors(replace(same, photos=same.photos[:2]), PriorError(0.2, 0.5), seed=3)
     np.testing.assert_array_equal(priors[:2], fewer)
     assert not np.allclose(priors[0], priors[1])
-    assert not np.allclose(priors[0], make_priors(scene, PriorError(0.2, 0.5), seed=4)[0])
+    assert not np.allclose(priors[0], make_priors(same, PriorError(0.2, 0.5), seed=4)[0])
+
+
+def test_paper_gives_each_photo_one_prior(scene):
+    priors = PROTOCOLS["paper"](scene, 1.0, 3)
+    assert [(prior.photo, prior.step) for prior in priors] == [(0, 0), (1, 0), (2, 0)]
+    np.testing.assert_array_equal(
+        [prior.T_map_camera for prior in priors], make_priors(scene, paper_prior_error(scene, 1.0), 3)
+    )
+
+
+def offsets(scene, priors):
+    """Rotation vectors in degrees and translations of priors in the frames of the true cameras."""
+    moved = [invert(scene.photos[prior.photo].T_map_camera) @ prior.T_map_camera for prior in priors]
+    return np.degrees([so3_log(offset[:3, :3]) for offset in moved]), np.array([offset[:3, 3] for offset in moved])
+
+
+def test_chen_draws_five_priors_a_photo_in_its_ranges(scene):
+    priors = PROTOCOLS["chen"](scene, 1.0, 0)
+    assert [(prior.photo, prior.step) for prior in priors] == [(i, k) for i in range(3) for k in range(5)]
+    many = replace(scene, photos=scene.photos[:1] * 400)
+    turns, moves = offsets(many, PROTOCOLS["chen"](many, 1.0, 0))
+    radius = trajectory_radius(scene)
+    for vectors, low, high in ((turns, 10, 40), (moves, 0, 0.2 * radius)):
+        lengths = np.linalg.norm(vectors, axis=1)
+        assert low <= lengths.min() < low + 0.02 * (high - low)
+        assert high - 0.02 * (high - low) < lengths.max() <= high
+        assert lengths.mean() == pytest.approx((low + high) / 2, rel=0.04)
+        np.testing.assert_allclose((vectors / lengths[:, None]).mean(axis=0), 0, atol=0.04)
+    half = offsets(many, PROTOCOLS["chen"](many, 0.5, 0))
+    np.testing.assert_allclose(half, np.array([turns, moves]) / 2, atol=1e-9)
+
+
+@pytest.mark.parametrize("protocol", ["paper", "chen"])
+def test_covariance_of_a_prior_is_that_of_the_errors(scene, protocol):
+    many = replace(scene, photos=scene.photos[1:2] * 2000)
+    priors = PROTOCOLS[protocol](many, 1.0, 0)
+    true = scene.photos[1].T_map_camera
+    errors = [
+        np.concatenate([prior.T_map_camera[:3, 3] - true[:3, 3], so3_log(prior.T_map_camera[:3, :3] @ true[:3, :3].T)])
+        for prior in priors
+    ]
+    scale = np.sqrt(np.diag(priors[0].covariance))
+    correlation = np.cov(np.transpose(errors)) / np.outer(scale, scale)
+    np.testing.assert_allclose(correlation, np.eye(6), atol=0.12)
+
+
+@pytest.mark.parametrize("protocol", ["sweep-rotation", "sweep-translation"])
+def test_sweeps_go_to_the_bound_in_ten_steps(scene, protocol):
+    priors = PROTOCOLS[protocol](scene, 2.0, 0)
+    assert [(prior.photo, prior.step) for prior in priors] == [(i, k) for i in range(3) for k in range(11)]
+    turns, moves = offsets(scene, priors)
+    rotation, translation = paper_bounds(scene)
+    steps = np.tile(np.linspace(0, 2, 11), 3)[:, None]
+    if protocol == "sweep-rotation":
+        # A camera that is panned to the right turns about its y axis, which points down.
+        np.testing.assert_allclose(turns, steps * np.degrees([0, rotation, 0]), atol=1e-6)
+        np.testing.assert_allclose(moves, 0, atol=1e-12)
+    else:
+        np.testing.assert_allclose(moves, steps * [translation, 0, 0], atol=1e-9)
+        np.testing.assert_allclose(turns, 0, atol=1e-6)
+
+
+def test_bounds_of_lego_are_those_of_the_authors_sweep(shared):
+    # 33.84 degrees in run_gsfeatloc_sensitivity_analysis.sh of github.com/jongwonjlee/gsfeatloc.
+    rotation, _ = paper_bounds(load_scene(shared / "scenes/lego"))
+    assert np.degrees(rotation) == pytest.approx(33.84, abs=0.01)
+
+
+@given(seed=st.integers(0, 2**32 - 1), sigma=st.floats(0, 3))
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_protocols_give_poses(scene_of_one, protocol, seed, sigma):
+    for prior in PROTOCOLS[protocol](scene_of_one, sigma, seed):
+        rotation = prior.T_map_camera[:3, :3]
+        np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-9)
+        np.testing.assert_array_equal(prior.T_map_camera[3], [0, 0, 0, 1])
+
+
+@pytest.fixture(scope="module")
+def scene_of_one():
+    photos = (Photo("a.png", Path("a.png"), CAMERA, PRIOR),)
+    return Scene("one", Path("map.ply"), photos, np.array([PRIOR, np.eye(4)]), (0.0, 0.0, 0.0))
+
+
+# Priors from a file
+
+
+def fields_of(pose):
+    """A pose as TUM and CSV files have it."""
+    return [f"{value:.17g}" for value in (*pose[:3, 3], *quaternion_from_matrix(pose[:3, :3]))]
+
+
+def random_poses(count):
+    rng = np.random.default_rng(0)
+    return [make_pose(so3_exp(rng.uniform(0, 3) * random_unit_vector(rng)), rng.normal(size=3)) for _ in range(count)]
+
+
+# The photos of the scene are 0.5.png, 1.5.png and 2.5.png: a stamp and a suffix, as TUM's are.
+@pytest.mark.parametrize("names", [["2.5", "0.5", "9.5", "0.5"], ["2.5.png", "0.5.png", "9.5.png", "0.5.png"]])
+@pytest.mark.parametrize("kind", ["txt", "csv"])
+def test_priors_from_a_file(tmp_path, scene, names, kind):
+    poses = random_poses(4)
+    path = tmp_path / f"priors.{kind}"
+    if kind == "txt":
+        lines = ["# stamp tx ty tz qx qy qz qw", ""]
+        lines += [" ".join([name, *fields_of(pose)]) for name, pose in zip(names, poses, strict=True)]
+    else:
+        lines = ["qw, name, tx, ty, tz, qx, qy, qz, inliers"]
+        for name, pose in zip(names, poses, strict=True):
+            *others, qw = fields_of(pose)
+            lines.append(", ".join([qw, name, *others, "12"]))
+    path.write_text("\n".join(lines))
+    priors = read_priors(path, scene)
+    assert [(prior.photo, prior.step) for prior in priors] == [(0, 0), (0, 1), (2, 0)]
+    np.testing.assert_allclose([p.T_map_camera for p in priors], [poses[1], poses[3], poses[0]], atol=1e-12)
+    assert priors[0].covariance is None
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("a.txt", "", "no line is of a photo of circle; they are named like 0.5.png"),
+        ("a.txt", "7.5 0 0 0 0 0 0 1", "no line is of a photo of circle"),
+        ("a.txt", "#\n0.5 0 0 0 0 0 1", "line 2 does not hold a pose"),
+        ("a.txt", "0.5 0 0 0 0 0 0 0", "line 1 does not hold a pose"),
+        ("a.txt", "0.5 0 nan 0 0 0 0 1", "line 1 does not hold a pose"),
+        ("a.txt", "0.5 0 x 0 0 0 0 1", "line 1 does not hold a pose"),
+        ("a.csv", "", "the header lacks name, tx"),
+        ("a.csv", "name,tx,ty,tz,qx,qy,qz", "the header lacks qw"),
+        ("a.csv", "name,tx,ty,tz,qx,qy,qz,qw\n0.5,0,0,0,0,0,0", "line 2 does not hold a pose"),
+    ],
+)
+def test_priors_file_that_cannot_be_used(tmp_path, scene, name, text, message):
+    path = tmp_path / name
+    path.write_text(text)
+    with pytest.raises(ValueError, match=f"{name}: {message}"):
+        read_priors(path, scene)
+
+
+def test_priors_file_that_is_not_there(tmp_path, scene):
+    with pytest.raises(ValueError, match=r"a\.txt: cannot be read: No such file"):
+        read_priors(tmp_path / "a.txt", scene)
 
 
 # The published recipe
@@ -270,10 +290,6 @@ class GivenDepth:
 
     def render(self, camera, T_map_camera):
         return self._render
-
-
-CAMERA = Camera(320, 240, np.array([[300.0, 0, 160], [0, 300.0, 120], [0, 0, 1]]))
-PRIOR = make_pose(so3_exp(np.array([0.3, -1.2, 0.8])), np.array([5.0, -3.0, 2.0]))
 
 
 def shifted_pixels(rng, count=200):
@@ -333,11 +349,12 @@ def moved(degrees, distance):
     return make_pose(so3_exp(np.radians([0.0, degrees, 0.0])), np.array([0.0, 0.0, distance]))
 
 
-def answer(degrees, distance):
-    return Estimate(Status.LOCALIZED, "found", moved(degrees, distance), matches=30, inliers=20, passes=2)
+def answer(degrees, distance, covariance=None):
+    return Estimate(Status.LOCALIZED, "found", moved(degrees, distance), covariance, matches=30, inliers=20, passes=2)
 
 
 FAILED = Estimate(Status.FAILED, "3 matches", matches=3)
+REJECTED = Estimate(Status.REJECTED, "no agreement", matches=50, inliers=9, passes=2, reprojection_error=1.5)
 
 
 def result(estimate, prior=None, prior_is_answer=False, milliseconds=10.0):
@@ -375,6 +392,58 @@ def test_the_publication_answers_with_the_prior():
     assert not result(FAILED, prior=moved(20.0, 0.02), prior_is_answer=True).success
 
 
+def test_a_rejected_estimate_is_no_answer():
+    r = result(REJECTED)
+    assert (r.status, r.answered, r.success, r.verdict) == ("rejected", False, False, "none")
+    assert (r.matches, r.inliers, r.passes) == (50, 9, 2)
+    assert r.evidence["reprojection_error"] == 1.5
+
+
+def test_what_an_estimate_carries_is_kept_and_ready_for_json():
+    estimate = replace(answer(1.0, 0.0), milliseconds={"render": 3.0, "total": 7.0})
+    r = result(estimate)
+    assert r.status == "localized"
+    assert r.stage_milliseconds == {"render": 3.0, "total": 7.0}
+    # Every number of an Estimate is there, and what is not a number by its absence.
+    numbers = {field.name for field in fields(Estimate) if field.type in ("int", "float")}
+    assert set(r.evidence) == numbers - {"matches", "inliers", "passes"}
+    assert r.evidence["reprojection_error"] is None
+    assert r.nees is None
+    assert r.in_ellipsoid is None
+    assert QueryResult(**json.loads(json.dumps(asdict(r), allow_nan=False))) == r
+
+
+def test_nees_of_a_known_error():
+    # Off by 0.3 along z and half a degree about y, with standard deviations of 0.1 and a quarter of a degree.
+    covariance = np.diag([0.1**2] * 3 + [np.radians(0.25) ** 2] * 3)
+    r = result(answer(0.5, 0.3, covariance))
+    assert r.nees == pytest.approx((3**2 + 2**2) / 6)
+    # 13 is over the 95 % quantile of the chi-square distribution with 6 degrees of freedom, 12.59.
+    assert r.in_ellipsoid == {"50": False, "90": False, "95": False}
+    assert result(answer(0.5, 0.28, covariance)).in_ellipsoid == {"50": False, "90": False, "95": True}
+    assert result(answer(0.5, 0.11, covariance)).in_ellipsoid == {"50": True, "90": True, "95": True}
+
+
+def test_chi_square_distribution_is_that_of_the_tables():
+    # Quantiles of Abramowitz and Stegun, table 26.8.
+    quantiles = [1.63538, 5.34812, 10.6446, 12.5916, 16.8119]
+    np.testing.assert_allclose(chi_square_cdf(np.array(quantiles)), [0.05, 0.5, 0.9, 0.95, 0.99], atol=1e-5)
+    assert chi_square_cdf(0.0) == 0
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+def test_nees_is_calibrated_for_errors_of_the_covariance_itself(seed):
+    rng = np.random.default_rng(seed)
+    root = rng.normal(size=(6, 6)) * [1, 1, 1, 1e-2, 1e-2, 1e-2]
+    covariance = root.T @ root + 1e-8 * np.eye(6)
+    errors = rng.multivariate_normal(np.zeros(6), covariance, size=400, method="eigh")
+    # A rotation about the axes of the map frame multiplies from the left.
+    answers = [make_pose(so3_exp(e[3:]) @ PRIOR[:3, :3], PRIOR[:3, 3] + e[:3]) for e in errors]
+    nees = np.array([normalised_error(pose, covariance, PRIOR) for pose in answers])
+    assert nees.mean() == pytest.approx(1.0, abs=0.2)
+    assert np.mean(chi_square_cdf(6 * nees) < 0.9) == pytest.approx(0.9, abs=0.1)
+
+
 def test_summary():
     results = [
         result(answer(1.0, 0.02), milliseconds=10),
@@ -393,72 +462,36 @@ def test_summary():
     assert json.loads(json.dumps(summary, allow_nan=False)) == summary
 
 
-# The command
+def test_summary_of_the_covariances():
+    # Errors along z in standard deviations; 6 NEES is their square, and 5.35, 10.6 and 12.6 are the limits.
+    covariance = np.diag([0.01**2] * 3 + [1e-6] * 3)
+    results = [result(answer(0.0, 0.01 * error, covariance)) for error in (1.0, 2.0, 3.0, 3.4)]
+    results += [result(FAILED), result(answer(0.0, 0.0))]  # neither has a covariance
+    summary = summarize(results)
+    assert summary["nees_mean"] == pytest.approx((1 + 4 + 9 + 11.56) / 24)
+    assert summary["nees_median"] == pytest.approx(6.5 / 6)
+    assert summary["coverage"] == {"50": 0.5, "90": 0.75, "95": 1.0}
+    none = summarize([result(FAILED)])
+    assert (none["nees_mean"], none["nees_median"], none["coverage"]) == (None, None, None)
 
 
-@pytest.mark.parametrize("method", ["default", "published"])
-def test_command_writes_its_report(shared, tmp_path, capsys, method):
-    path = tmp_path / "report.json"
-    scene = str(shared / "scenes/bonsai")
-    assert (
-        main([scene, "--method", method, "--matcher", "sift", "--limit", "2", "--sigma", "0.3", "--json", str(path)])
-        == 0
-    )
-    report = json.loads(path.read_text())
-    assert list(report) == [
-        "scene",
-        "protocol",
-        "method",
-        "matcher",
-        "sigma",
-        "seed",
-        "queries",
-        "success_rate",
-        "rotation_error_deg",
-        "translation_error",
-        "answered",
-        "wrong_answers",
-        "milliseconds",
-        "per_query",
+def test_best_of_a_photos_priors_has_the_smallest_error_for_its_limits():
+    # A photo's errors over the limits: 0.5 (translation), 0.4 (rotation), no answer.
+    results = [result(answer(0.5, 0.05)), result(answer(2.0, 0.01)), result(FAILED)]
+    other = replace(result(answer(1.0, 0.0)), photo="b.png")
+    assert best_of([*results, other]) == [results[1], other]
+    assert best_of([]) == []
+
+
+def test_success_by_step():
+    results = [
+        replace(result(answer(1.0, 0.0), prior=moved(10.0, 0.0)), step=1),
+        replace(result(answer(9.0, 0.0), prior=moved(10.0, 0.0)), step=1),
+        replace(result(FAILED, prior=moved(20.0, 1.0)), step=2),
     ]
-    assert (report["scene"], report["protocol"], report["method"]) == ("bonsai", "paper", method)
-    assert (report["matcher"], report["sigma"], report["seed"], report["queries"]) == ("sift", 0.3, 0, 2)
-    assert report["success_rate"] == 1.0
-    assert report["rotation_error_deg"]["median"] < 1.0
-    assert report["milliseconds"]["median"] > 0
-    printed = capsys.readouterr().out
-    assert "DSCF5565.jpg" in printed
-    assert "100.0 % of 2" in printed
-
-
-def test_command_gives_the_same_answer_to_the_same_seed(shared, tmp_path):
-    reports = []
-    for number, limit in enumerate(("1", "2")):
-        path = tmp_path / f"{number}.json"
-        scene = str(shared / "scenes/lego")
-        main(
-            [scene, "--method", "published", "--matcher", "sift", "--seed", "5", "--limit", limit, "--json", str(path)]
-        )
-        reports.append(json.loads(path.read_text())["per_query"][0])
-        del reports[-1]["milliseconds"]
-    assert reports[0] == reports[1]
-
-
-def test_command_on_a_folder_without_a_scene(tmp_path, capsys):
-    assert main([str(tmp_path)]) == 1
-    assert "transforms.json" in capsys.readouterr().err
-
-
-def test_command_on_a_scene_without_a_map(tmp_path, transforms, capsys):
-    assert main([str(save_scene(tmp_path, transforms))]) == 1
-    assert "map.ply" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [["--sigma", "-1"], ["--sigma", "nan"], ["--limit", "x"], ["--max-width", "0"], ["--json", "/nowhere/a.json"]],
-)
-def test_command_refuses_wrong_options_before_it_starts(tmp_path, wrong, capsys):
-    with pytest.raises(SystemExit, match="2"):
-        main([str(tmp_path), *wrong])
-    assert wrong[0] in capsys.readouterr().err
+    first, second = by_step(results)
+    assert first["prior_rotation_error_deg"] == pytest.approx(10.0)
+    assert (first["queries"], first["success_rate"], first["wrong_answers"]) == (2, 0.5, 1)
+    assert second["prior_translation_error"] == pytest.approx(0.5)
+    assert (second["queries"], second["success_rate"], second["wrong_answers"]) == (1, 0.0, 0)
+    assert by_step([]) == []

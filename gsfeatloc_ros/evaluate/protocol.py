@@ -8,20 +8,47 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsfeatloc_ros.evaluate.scene import Scene
+from gsfeatloc_ros.evaluate.dataset import Scene
 from gsfeatloc_ros.geometry import make_pose, random_unit_vector, so3_exp
 
 # Square root of the 95 % quantile of the chi-square distribution with 3 degrees of freedom: the published bounds below
 # are taken as the radius of the ball that holds 95 % of an isotropic 3D normal distribution.
 _QUANTILE_95 = 2.7955
+_SWEEP_STEPS = 10
+_CHEN_REPETITIONS = 5
+_CHEN_ROTATION_DEG = (10.0, 40.0)
+_CHEN_TRANSLATION = (0.0, 0.2)  # of the trajectory's radius
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """A wrong pose from which a photo is localized.
+
+    Attributes:
+        photo: index of the photo in its scene.
+        step: which of the photo's priors this is: the repetition, or the step of a sweep.
+        T_map_camera: (4, 4) the pose.
+        covariance: (6, 6) of the protocol's errors, as one knows it of a prior in practice: x y z and rotation about
+            x y z, axes of the map frame, map units and radians; None if it is not known.
+    """
+
+    photo: int
+    step: int
+    T_map_camera: np.ndarray
+    covariance: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
 class PriorError:
-    """Standard deviations of a prior's error: rotation in radians, translation in map units."""
+    """Standard deviations of a prior's error along a random direction: in radians and in map units."""
 
     rotation: float
     translation: float
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """Covariance (6, 6) of translation and rotation vector; in whatever axes, as all directions are alike."""
+        return np.diag(np.repeat(np.square([self.translation, self.rotation]) / 3, 3))
 
 
 def trajectory_radius(scene: Scene) -> float:
@@ -30,17 +57,20 @@ def trajectory_radius(scene: Scene) -> float:
     return float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).mean())
 
 
-def paper_prior_error(scene: Scene, sigma: float) -> PriorError:
-    """Prior error of the published evaluation of GSFeatLoc, scaled by `sigma`.
+def paper_bounds(scene: Scene) -> tuple[float, float]:
+    """Largest prior errors of the published evaluation of GSFeatLoc: rotation in radians, translation in map units.
 
     The view of a prior may move by half of the field of view and a quarter more:
     dtheta = FOV_x / 2 + atan(1 / 4), dp = R (tan(FOV_x / 2) + 1 / 4), with R the radius of the trajectory.
     """
     half_fov = 0.5 * scene.camera.fov_x
-    return PriorError(
-        rotation=sigma * (half_fov + math.atan(0.25)) / _QUANTILE_95,
-        translation=sigma * trajectory_radius(scene) * (math.tan(half_fov) + 0.25) / _QUANTILE_95,
-    )
+    return half_fov + math.atan(0.25), trajectory_radius(scene) * (math.tan(half_fov) + 0.25)
+
+
+def paper_prior_error(scene: Scene, sigma: float) -> PriorError:
+    """Prior error of the published evaluation of GSFeatLoc, scaled by `sigma`: 95 % are within `paper_bounds`."""
+    rotation, translation = paper_bounds(scene)
+    return PriorError(sigma * rotation / _QUANTILE_95, sigma * translation / _QUANTILE_95)
 
 
 def perturb(T_map_camera: np.ndarray, error: PriorError, rng: np.random.Generator) -> np.ndarray:
@@ -50,8 +80,8 @@ def perturb(T_map_camera: np.ndarray, error: PriorError, rng: np.random.Generato
     uniformly random axis by a normally distributed angle, both in its own frame.
     """
     translation = rng.normal(0.0, error.translation) * random_unit_vector(rng)
-    rotation = so3_exp(rng.normal(0.0, error.rotation) * random_unit_vector(rng))
-    return T_map_camera @ make_pose(np.eye(3), translation) @ make_pose(rotation, np.zeros(3))
+    rotation = rng.normal(0.0, error.rotation) * random_unit_vector(rng)
+    return _moved(T_map_camera, rotation, translation)
 
 
 def make_priors(scene: Scene, error: PriorError, seed: int) -> list[np.ndarray]:
@@ -62,4 +92,72 @@ def make_priors(scene: Scene, error: PriorError, seed: int) -> list[np.ndarray]:
     ]
 
 
-PROTOCOLS: dict[str, Callable[[Scene, float], PriorError]] = {"paper": paper_prior_error}
+def paper(scene: Scene, sigma: float, seed: int) -> list[Prior]:
+    """The published evaluation of GSFeatLoc: one normally distributed prior a photo, see `paper_prior_error`."""
+    error = paper_prior_error(scene, sigma)
+    return [Prior(index, 0, pose, error.covariance) for index, pose in enumerate(make_priors(scene, error, seed))]
+
+
+def chen(scene: Scene, sigma: float, seed: int) -> list[Prior]:
+    """Five priors a photo, moved by 0 to 0.2 radii and turned by 10 to 40 degrees, uniformly, in random directions.
+
+    `sigma` scales the errors.
+    """
+    radius = trajectory_radius(scene)
+    covariance = PriorError(
+        sigma * np.radians(_root_mean_square(*_CHEN_ROTATION_DEG)),
+        sigma * radius * _root_mean_square(*_CHEN_TRANSLATION),
+    ).covariance
+    priors = []
+    for index, photo in enumerate(scene.photos):
+        for repetition in range(_CHEN_REPETITIONS):
+            rng = np.random.default_rng([seed, index, repetition])
+            translation = sigma * radius * rng.uniform(*_CHEN_TRANSLATION) * random_unit_vector(rng)
+            rotation = sigma * np.radians(rng.uniform(*_CHEN_ROTATION_DEG)) * random_unit_vector(rng)
+            priors.append(Prior(index, repetition, _moved(photo.T_map_camera, rotation, translation), covariance))
+    return priors
+
+
+def sweep_rotation(scene: Scene, sigma: float, seed: int) -> list[Prior]:
+    """Every photo panned to the right by 0 to `sigma` times the rotation of `paper_bounds`, in ten steps."""
+    angles = _steps(sigma * paper_bounds(scene)[0])
+    return _sweep(scene, sigma, [(np.array([0.0, angle, 0.0]), np.zeros(3)) for angle in angles])
+
+
+def sweep_translation(scene: Scene, sigma: float, seed: int) -> list[Prior]:
+    """Every photo moved to the right by 0 to `sigma` times the translation of `paper_bounds`, in ten steps."""
+    distances = _steps(sigma * paper_bounds(scene)[1])
+    return _sweep(scene, sigma, [(np.zeros(3), np.array([distance, 0.0, 0.0])) for distance in distances])
+
+
+PROTOCOLS: dict[str, Callable[[Scene, float, int], list[Prior]]] = {
+    "paper": paper,
+    "chen": chen,
+    "sweep-rotation": sweep_rotation,
+    "sweep-translation": sweep_translation,
+}
+SWEEPS = ("sweep-rotation", "sweep-translation")
+
+
+def _steps(bound: float) -> np.ndarray:
+    return np.linspace(0.0, bound, _SWEEP_STEPS + 1)
+
+
+def _sweep(scene: Scene, sigma: float, moves: list[tuple[np.ndarray, np.ndarray]]) -> list[Prior]:
+    """The priors of all photos, each moved by all `moves` (rotation vector, translation)."""
+    covariance = paper_prior_error(scene, sigma).covariance
+    return [
+        Prior(index, step, _moved(photo.T_map_camera, *move), covariance)
+        for index, photo in enumerate(scene.photos)
+        for step, move in enumerate(moves)
+    ]
+
+
+def _root_mean_square(low: float, high: float) -> float:
+    """Of a variable uniform between two values."""
+    return math.sqrt((low * low + low * high + high * high) / 3)
+
+
+def _moved(T_map_camera: np.ndarray, rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
+    """The pose (4, 4) moved by a translation (3,), then turned by a rotation vector (3,), both in its own frame."""
+    return T_map_camera @ make_pose(np.eye(3), translation) @ make_pose(so3_exp(rotation), np.zeros(3))

@@ -10,8 +10,8 @@ from gsfeatloc_ros.render.base import Render
 
 # The photo is divided into this many cells across and down.
 _CELLS = (8, 6)
-# Photo and render are compared at this width: what splats do not draw sharply is gone, and misalignment is small.
-_COMPARED_WIDTH = 160
+# Photo and render are compared at this width: finer detail splats do not draw, and a mirror image has the coarser too.
+_COMPARED_WIDTH = 320
 # Standard deviation, in compared pixels, of the neighbourhood whose mean brightness and contrast are taken out.
 _NEIGHBOURHOOD = 6.0
 # Contrast (of 255) under which a neighbourhood says nothing: sky, a blank wall.

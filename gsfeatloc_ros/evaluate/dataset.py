@@ -1,0 +1,87 @@
+"""Photos with known poses, and the map of the place."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from gsfeatloc_ros.camera import Camera
+
+
+@dataclass(frozen=True, eq=False)
+class Photo:
+    """A test photo.
+
+    Attributes:
+        name: that no other photo of the scene has: the file's, or the path in the scene's folder.
+        path: the file.
+        camera: that took it.
+        T_map_camera: (4, 4) true pose, camera axes as in OpenCV.
+    """
+
+    name: str
+    path: Path
+    camera: Camera
+    T_map_camera: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A map with photos of the same place.
+
+    Attributes:
+        name: name of the folder.
+        map_path: the map file.
+        photos: the test photos, at least one, in the order of the data set.
+        trajectory: (F, 4, 4) float64 poses T_map_camera of all frames, those that made the map included.
+        background: RGB in [0, 1] that lies behind the objects in the photos and has to lie behind the map: white where
+            photos have an alpha channel (they are cut out, and NeRF-Synthetic's convention is white), else black.
+    """
+
+    name: str
+    map_path: Path
+    photos: tuple[Photo, ...]
+    trajectory: np.ndarray
+    background: tuple[float, float, float]
+
+    @property
+    def camera(self) -> Camera:
+        """The camera of the first photo; most scenes have no other."""
+        return self.photos[0].camera
+
+    def read_photo(self, photo: Photo) -> np.ndarray:
+        """Read a photo as RGB (H, W, 3) uint8, composited on the background where it has an alpha channel.
+
+        Raises:
+            ValueError: the file is not an image or not of its camera's size.
+        """
+        pixels = read_image(photo.path)
+        camera = photo.camera
+        if pixels.shape[:2] != (camera.height, camera.width):
+            raise ValueError(
+                f"{photo.path}: is {pixels.shape[1]}x{pixels.shape[0]}, its camera is {camera.width}x{camera.height}"
+            )
+        if pixels.shape[2] == 3:
+            return pixels
+        alpha = pixels[..., 3:] / 255.0
+        on_background = alpha * pixels[..., :3] + (1.0 - alpha) * 255.0 * np.array(self.background)
+        return np.rint(on_background).astype(np.uint8)
+
+
+def read_image(path: Path) -> np.ndarray:
+    """Read an image as RGB or, where it has an alpha channel, RGBA: (H, W, 3 or 4) uint8.
+
+    Raises:
+        ValueError: the file is missing or not an 8-bit colour image.
+    """
+    if not path.is_file():
+        raise ValueError(f"{path}: is missing")
+    pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if pixels is None:
+        raise ValueError(f"{path}: is not an image")
+    if pixels.dtype != np.uint8 or pixels.ndim != 3:
+        raise ValueError(f"{path}: is not an 8-bit colour image")
+    return cv2.cvtColor(pixels, cv2.COLOR_BGRA2RGBA if pixels.shape[2] == 4 else cv2.COLOR_BGR2RGB)

@@ -1,0 +1,79 @@
+"""Priors from another system, such as a 6DGS or odometry run, in a file.
+
+TUM: lines ``NAME tx ty tz qx qy qz qw`` (what starts with # is a comment); CSV, with the suffix .csv: a header with the
+columns ``name,tx,ty,tz,qx,qy,qz,qw`` in any order. The poses are of the camera's optical frame in the map's. NAME, for
+TUM usually a stamp, is the name of the photo's file, with or without its extension.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from gsfeatloc_ros.evaluate.dataset import Scene
+from gsfeatloc_ros.evaluate.protocol import Prior
+from gsfeatloc_ros.geometry import make_pose, matrix_from_quaternion
+
+_NUMBERS = ("tx", "ty", "tz", "qx", "qy", "qz", "qw")
+
+
+def read_priors(path: Path, scene: Scene) -> list[Prior]:
+    """Read the priors of a scene's photos, in the order of the photos; lines of other photos are passed over.
+
+    A photo may have several priors, or none: it is not localized then.
+
+    Raises:
+        ValueError: the file cannot be read, a line is no pose, or no line is of a photo of the scene.
+    """
+    indices = {str(Path(photo.name).with_suffix("")): index for index, photo in enumerate(scene.photos)}
+    indices |= {photo.name: index for index, photo in enumerate(scene.photos)}
+    poses = []
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            for number, name, values in _csv_lines(file) if path.suffix == ".csv" else _tum_lines(file):
+                if name in indices:
+                    poses.append((indices[name], _pose(number, values)))
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be read: {error.strerror}") from error
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+    if not poses:
+        raise ValueError(f"{path}: no line is of a photo of {scene.name}; they are named like {scene.photos[0].name}")
+    seen: Counter[int] = Counter()
+    priors = []
+    for index, pose in sorted(poses, key=lambda pair: pair[0]):
+        priors.append(Prior(index, seen[index], pose))
+        seen[index] += 1
+    return priors
+
+
+def _tum_lines(file: Iterator[str]) -> Iterator[tuple[int, str, list[str]]]:
+    """Number, name and the seven values of each line."""
+    for number, line in enumerate(file, start=1):
+        fields = line.partition("#")[0].split()
+        if fields:
+            yield number, fields[0], fields[1:]
+
+
+def _csv_lines(file: Iterator[str]) -> Iterator[tuple[int, str, list[str]]]:
+    reader = csv.DictReader(file, skipinitialspace=True)
+    missing = [name for name in ("name", *_NUMBERS) if name not in (reader.fieldnames or ())]
+    if missing:
+        raise ValueError(f"the header lacks {', '.join(missing)}")
+    for row in reader:
+        yield reader.line_num, row["name"], [row[name] for name in _NUMBERS]
+
+
+def _pose(number: int, values: list[str]) -> np.ndarray:
+    """T_map_camera (4, 4) from the fields of a line."""
+    try:
+        translation, quaternion = np.split(np.array([float(value) for value in values]), [3])
+        if quaternion.shape != (4,) or not np.isfinite(translation).all():
+            raise ValueError
+        return make_pose(matrix_from_quaternion(quaternion), translation)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"line {number} does not hold a pose, {' '.join(_NUMBERS)}: {values}") from error
