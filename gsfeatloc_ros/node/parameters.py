@@ -49,8 +49,12 @@ def _option(name: str, description: str, bounds: tuple[float, float]) -> Paramet
 PARAMETERS = (
     Parameter("map.path", "", "Path of the 3D Gaussian Splatting map, a .ply file (required)."),
     Parameter("map.frame_id", "map", "Name of the map's frame: of the prior that is taken and of the pose given."),
-    Parameter("matcher.name", "xfeat", f"Feature matcher: {' or '.join(sorted(MATCHERS))}."),
-    Parameter("matcher.weights", "", "Path of the weights of a learned matcher; empty looks in the usual places."),
+    Parameter("matcher.name", "xfeat", f"Feature matcher: {', '.join(MATCHERS)}."),
+    Parameter(
+        "matcher.weights",
+        "",
+        "Path of a learned matcher's weights (two networks: of their folder); empty looks in the usual places.",
+    ),
     Parameter("matcher.max_features", DEFAULT_MAX_FEATURES, "Most features taken from an image.", (64, 32768)),
     Parameter("renderer.device", "auto", "Where to render: cpu, or auto to choose."),
     Parameter("renderer.threads", 0, "Threads of the CPU renderer; 0 takes all cores.", (0, 1024)),

