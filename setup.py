@@ -32,7 +32,7 @@ setup(
     zip_safe=True,
     python_requires=">=3.11,<3.13",
     install_requires=[
-        "kornia>=0.8.3,<0.10",  # the first with XFeat
+        "kornia>=0.9,<0.10",  # the first whose LoFTR gives an image's features apart
         "numba>=0.60,<0.70",
         "numpy>=1.26,<3",
         "opencv-python-headless>=4.8,<6",
