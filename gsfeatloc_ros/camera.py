@@ -75,6 +75,11 @@ class Camera:
             return self
         return self.scaled(max_width, max(1, round(self.height * max_width / self.width)))
 
+    def limit(self, image: np.ndarray, max_width: int) -> tuple[np.ndarray, Camera]:
+        """Resize an image (H, W, C) of this camera to at most `max_width` pixels of width, with its camera."""
+        camera = self.limited(max_width)
+        return cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA), camera
+
     @property
     def distorted(self) -> bool:
         """Whether the lens is anything but a pinhole; a fisheye without coefficients is."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 
 from gsfeatloc_ros.camera import Camera
@@ -13,7 +12,7 @@ from gsfeatloc_ros.geometry import invert, so3_log, transform
 from gsfeatloc_ros.match.base import Features, Matcher
 from gsfeatloc_ros.pose.acceptance import agreement, coverage
 from gsfeatloc_ros.render.base import Renderer
-from gsfeatloc_ros.search import MIN_HINT, promising_poses, spread_poses
+from gsfeatloc_ros.search import MIN_HINT, SEARCH_WIDTH, promising_poses, spread_poses
 from gsfeatloc_ros.timing import StageClock
 from gsfeatloc_ros.view import MatchedView, match_view
 
@@ -113,14 +112,13 @@ class Localizer:
         if np.shape(prior_covariance) != (6, 6) or not np.isfinite(prior_covariance).all():
             raise ValueError("the prior's covariance must be a finite 6x6 matrix")
         clock = StageClock()
-        camera = camera.limited(self._options.max_image_width)
-        image = cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+        image, camera = camera.limit(image, self._options.max_image_width)
         with clock.stage("features"):
             features = self._matcher.features(image)
         prior = np.asarray(T_map_camera_prior, dtype=np.float64)
         query = _Query(image, camera, features, prior, np.asarray(prior_covariance, dtype=np.float64), clock)
         estimate = self._refine(query, prior)
-        if not estimate.localized and len(features) >= MIN_HINT:
+        if not estimate.localized and self._options.max_views and len(features) >= MIN_HINT:
             estimate = self._search(query, estimate)
         return replace(estimate, milliseconds=clock.milliseconds())
 
@@ -196,14 +194,17 @@ class Localizer:
     def _search(self, query: _Query, failure: Estimate) -> Estimate:
         """Start again from other views round the prior; `failure` where none of them leads to an answer."""
         options = self._options
+        image, camera = query.camera.limit(query.image, SEARCH_WIDTH)
+        with query.clock.stage("features"):
+            features = self._matcher.features(image)
         poses = spread_poses(query.prior, query.prior_covariance, options.max_views, options.seed)
         for start in range(0, len(poses), _BATCH):
             batch = poses[start : start + _BATCH]
             for pose in promising_poses(
                 self._renderer,
                 self._matcher,
-                query.image,
-                query.camera,
+                features,
+                camera,
                 batch,
                 options.max_reprojection_error,
                 options.seed,

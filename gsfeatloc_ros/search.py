@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 
 from gsfeatloc_ros.camera import Camera
 from gsfeatloc_ros.geometry import make_pose, so3_exp
-from gsfeatloc_ros.match.base import Matcher
+from gsfeatloc_ros.match.base import Features, Matcher
 from gsfeatloc_ros.render.base import Renderer
 from gsfeatloc_ros.timing import StageClock
 from gsfeatloc_ros.view import match_view
@@ -15,7 +14,7 @@ from gsfeatloc_ros.view import match_view
 # Matches that agree on a pose, by which a view suggests it. The render at that pose then is the judge.
 MIN_HINT = 8
 # Views are compared with the photo at this width, which is cheap and enough to tell which is worth more.
-_WIDTH = 320
+SEARCH_WIDTH = 320
 # Of the views that are looked at together, the best of this many are followed.
 _FOLLOWED = 2
 # Views are chosen from this many random ones for each that is looked at.
@@ -27,7 +26,7 @@ _REACH = 3.26
 def promising_poses(
     renderer: Renderer,
     matcher: Matcher,
-    image: np.ndarray,
+    query: Features,
     camera: Camera,
     poses: list[np.ndarray],
     max_error: float,
@@ -38,15 +37,13 @@ def promising_poses(
 
     Args:
         renderer, matcher: of the map and of features.
-        image: (H, W, 3) uint8 RGB, as observed by `camera`.
+        query: features of the photo, resized to at most SEARCH_WIDTH.
+        camera: of the photo at that size.
         poses: (4, 4) each, T_map_camera of the views.
         max_error: reprojection error in pixels of the small image up to which a match agrees with a pose.
         seed: of RANSAC.
         clock: on which the stages of the views are counted.
     """
-    camera = camera.limited(_WIDTH)
-    with clock.stage("features"):
-        query = matcher.features(cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA))
     views = [match_view(renderer, matcher, query, camera, pose, max_error, seed, clock) for pose in poses]
     hints = [view for view in views if view.inliers >= MIN_HINT]
     hints.sort(key=lambda view: view.inliers, reverse=True)

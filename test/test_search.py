@@ -12,7 +12,7 @@ from gsfeatloc_ros.geometry import make_pose, rotation_error_deg, so3_exp, so3_l
 from gsfeatloc_ros.localize import Localizer, LocalizerOptions
 from gsfeatloc_ros.match import create_matcher
 from gsfeatloc_ros.render import create_renderer
-from gsfeatloc_ros.search import promising_poses, spread_poses
+from gsfeatloc_ros.search import SEARCH_WIDTH, promising_poses, spread_poses
 from gsfeatloc_ros.timing import StageClock
 
 POSE = make_pose(so3_exp(np.array([0.3, -0.2, 1.0])), np.array([1.0, 2.0, 3.0]))
@@ -71,6 +71,13 @@ def renderer(room_map):
     return create_renderer(room_map)
 
 
+def look(renderer, camera, image: np.ndarray, views: list[np.ndarray]) -> list[np.ndarray]:
+    """What the views suggest of a photo."""
+    matcher = create_matcher("sift")
+    small, small_camera = camera.limit(image, SEARCH_WIDTH)
+    return promising_poses(renderer, matcher, matcher.features(small), small_camera, views, 3.0, 0, StageClock())
+
+
 def turned(pose: np.ndarray, degrees: float) -> np.ndarray:
     """The camera turned to its side."""
     return pose @ make_pose(so3_exp(np.radians([0.0, degrees, 0.0])), np.zeros(3))
@@ -81,9 +88,7 @@ def test_promising_poses_come_best_first_from_the_views_that_share_something(
 ) -> None:
     truth = room_queries[0].T_map_camera
     views = [turned(truth, 180), turned(truth, 20), turned(truth, 5)]
-    found = promising_poses(
-        renderer, create_matcher("sift"), room_queries[0].image, room_camera, views, 3.0, 0, StageClock()
-    )
+    found = look(renderer, room_camera, room_queries[0].image, views)
     assert len(found) == 2
     for pose in found:
         assert rotation_error_deg(pose, truth) < 2.0
@@ -91,8 +96,7 @@ def test_promising_poses_come_best_first_from_the_views_that_share_something(
 
 
 def test_no_views_no_poses(renderer, room_camera, room_queries) -> None:
-    image = room_queries[0].image
-    assert promising_poses(renderer, create_matcher("sift"), image, room_camera, [], 3.0, 0, StageClock()) == []
+    assert look(renderer, room_camera, room_queries[0].image, []) == []
 
 
 def test_finds_a_camera_that_was_turned_away(renderer, room_camera, room_queries) -> None:

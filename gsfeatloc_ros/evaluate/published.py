@@ -31,8 +31,7 @@ class PublishedLocalizer:
 
     def localize(self, image: np.ndarray, camera: Camera, T_map_camera_prior: np.ndarray) -> Estimate:
         """Estimate where `image` (H, W, 3) uint8 RGB, as observed by `camera`, was taken; see Estimate."""
-        camera = camera.limited(self._max_image_width)
-        image = cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+        image, camera = camera.limit(image, self._max_image_width)
         render = self._renderer.render(camera, T_map_camera_prior)
         matches = self._matcher.match(self._matcher.features(image), self._matcher.features(render.image()))
 

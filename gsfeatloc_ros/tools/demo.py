@@ -186,7 +186,7 @@ def draw_results(results: Sequence[Result], room_map: GaussianMap) -> np.ndarray
 def _draw_result(number: int, result: Result, renderer: Renderer) -> np.ndarray:
     query, pose = result.query, result.answer.T_map_camera
     # Renders are of a pinhole camera: without its distortion the photo can be compared with them.
-    photo = cv2.undistort(query.image, _CAMERA.K, _CAMERA.distortion)
+    photo = _CAMERA.undistort_image(query.image)
     at_prior = renderer.render(_CAMERA, query.T_map_camera_prior).image()
     if pose is None:
         at_estimate, words = np.zeros_like(photo), "no answer"
