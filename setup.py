@@ -32,6 +32,7 @@ setup(
     zip_safe=True,
     python_requires=">=3.11,<3.13",
     install_requires=[
+        "backports.zstd>=1.0,<2",  # .spz of version 4; in the standard library from Python 3.14 on
         "kornia>=0.9,<0.10",  # the first whose LoFTR gives an image's features apart
         "numba>=0.60,<0.70",
         "numpy>=1.26,<3",

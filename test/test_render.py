@@ -217,6 +217,27 @@ def test_threads_may_render_at_once() -> None:
         np.testing.assert_array_equal(result.rgb, expected.rgb)
 
 
+@pytest.mark.parametrize("sh_degree", [0, 2])
+def test_antialiased_maps_agree_with_the_reference(sh_degree: int) -> None:
+    gaussian_map = replace(random_map(800, sh_degree, seed=sh_degree), antialiased=True)
+    camera = small_camera()
+    fast = create_renderer(gaussian_map).render(camera, np.eye(4))
+    assert_same(fast, ReferenceRenderer(gaussian_map).render(camera, np.eye(4)), 70)
+    assert psnr(fast, create_renderer(replace(gaussian_map, antialiased=False)).render(camera, np.eye(4))) < 40
+
+
+@pytest.mark.parametrize("render", [create_renderer, ReferenceRenderer])
+@pytest.mark.parametrize("sigma", [0.1, 0.5, 2.0])
+def test_the_blur_of_an_antialiased_gaussian_keeps_its_light(render, sigma: float) -> None:
+    """A Gaussian of `sigma` pixels covers as much of the image as without the blur, however small it is."""
+    camera = Camera(65, 65, np.array([[100.0, 0, 32], [0, 100.0, 32], [0, 0, 1]]))
+    gaussian_map = replace(one_gaussian((0, 0, 10.0), sigma * 10.0 / 100.0, 0.99), antialiased=True)
+    alpha = render(gaussian_map).render(camera, np.eye(4)).alpha
+    assert alpha[32, 32] == pytest.approx(0.99 * sigma**2 / (sigma**2 + 0.3), rel=1e-3)
+    # Tails under 1/255 are cut.
+    assert alpha.sum() == pytest.approx(0.99 * 2 * np.pi * sigma**2, rel=0.15)
+
+
 def test_an_unknown_device_is_refused() -> None:
     with pytest.raises(ValueError, match=r"tpu.*not one of"):
         create_renderer(one_gaussian((0, 0, 2), 0.1, 1.0), device="tpu")

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
+
+from gsfeatloc_ros.maps.similarity import Similarity
 
 # Numbers of spherical-harmonics coefficients per colour channel for degrees 0 to 3.
 SH_COEFFICIENTS = (1, 4, 9, 16)
@@ -19,12 +21,15 @@ class GaussianMap:
     """Gaussians with their parameters activated, ready to be drawn.
 
     Attributes:
-        means: (N, 3) float32 centres.
-        scales: (N, 3) float32 standard deviations along the axes, > 0.
-        rotations: (N, 4) float32 unit quaternions wxyz that turn the Gaussian's axes into the map's.
+        means: (N, 3) float32 centres, splat frame.
+        scales: (N, 3) float32 standard deviations along the axes, > 0, splat units.
+        rotations: (N, 4) float32 unit quaternions wxyz that turn the Gaussian's axes into the splat frame's.
         opacities: (N,) float32 in [0, 1].
         sh: (N, C, 3) float32 spherical harmonics of the colour, C = 1, 4, 9 or 16 for degree 0 to 3, in the order of
             the INRIA rasterizer; colour = 0.5 + the harmonics' sum in the direction from the camera, cut at 0.
+        antialiased: trained with the filter of Mip-Splatting: a Gaussian that the 2D blur widens is dimmed as much.
+        S_map_splat: where the frame that the Gaussians were trained in lies in the robot's map frame. Renderers move
+            the camera by it, for spherical harmonics do not turn for free.
     """
 
     means: np.ndarray
@@ -32,6 +37,8 @@ class GaussianMap:
     rotations: np.ndarray
     opacities: np.ndarray
     sh: np.ndarray
+    antialiased: bool = False
+    S_map_splat: Similarity = field(default_factory=Similarity)
 
     def __len__(self) -> int:
         return len(self.means)

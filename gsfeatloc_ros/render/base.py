@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 
 from gsfeatloc_ros.camera import Camera
+from gsfeatloc_ros.maps.gaussian_map import GaussianMap
 
 # Conventions of gsplat and of the INRIA rasterizer: a Gaussian is blurred by 0.3 square pixels, contributes where its
 # alpha is at least 1/255, its alpha is cut at 0.999, and a ray ends before its transmittance falls to 1e-4.
@@ -51,3 +53,23 @@ class Renderer(Protocol):
     def render(self, camera: Camera, T_map_camera: np.ndarray) -> Render:
         """Draw what `camera` (its distortion ignored) sees from the pose `T_map_camera` (4, 4)."""
         ...
+
+
+class SplatRenderer(ABC):
+    """A renderer that draws in the splat frame: the camera is moved there, and depths come back in map units."""
+
+    def __init__(self, gaussian_map: GaussianMap) -> None:
+        self._map_scale = gaussian_map.S_map_splat.scale
+        self._S_splat_map = gaussian_map.S_map_splat.inverse()
+
+    def render(self, camera: Camera, T_map_camera: np.ndarray) -> Render:
+        """Draw what `camera` (its distortion ignored) sees from the pose `T_map_camera` (4, 4)."""
+        render = self._render(camera, self._S_splat_map.transform_pose(T_map_camera))
+        if self._map_scale != 1.0:
+            for depth in (render.depth, render.median_depth, render.depth_std):
+                depth *= self._map_scale
+        return render
+
+    @abstractmethod
+    def _render(self, camera: Camera, T_splat_camera: np.ndarray) -> Render:
+        """Draw what `camera` sees from `T_splat_camera` (4, 4), with depths in splat units, in arrays of its own."""

@@ -11,13 +11,13 @@ import numpy as np
 from gsfeatloc_ros.camera import Camera
 from gsfeatloc_ros.maps.gaussian_map import GaussianMap
 from gsfeatloc_ros.render import cpu_kernels as kernels
-from gsfeatloc_ros.render.base import MIN_ALPHA, Render
+from gsfeatloc_ros.render.base import MIN_ALPHA, Render, SplatRenderer
 
 # One frame at a time in the process: numba's fallback threading layer does not take parallel calls.
 _LOCK = threading.Lock()
 
 
-class CpuRenderer:
+class CpuRenderer(SplatRenderer):
     """Tile-based rasterizer, with gsplat's conventions (render/base.py).
 
     Three parallel steps: project the Gaussians and list the tiles that each touches; gather the lists by tile; sort
@@ -27,24 +27,25 @@ class CpuRenderer:
     def __init__(
         self, gaussian_map: GaussianMap, threads: int = 0, background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     ) -> None:
+        super().__init__(gaussian_map)
         self._threads = min(threads or _available_cores(), numba.config.NUMBA_NUM_THREADS)
         self._background = np.asarray(background, dtype=np.float32)
         seen = gaussian_map.opacities >= MIN_ALPHA
         self._means = np.ascontiguousarray(gaussian_map.means[seen])
         self._opacities = np.ascontiguousarray(gaussian_map.opacities[seen])
+        self._antialiased = gaussian_map.antialiased
         self._sh = np.ascontiguousarray(gaussian_map.sh[seen])
         self._covariances = kernels.covariances(gaussian_map.scales[seen], gaussian_map.rotations[seen])
         self._splats = np.empty((len(self._means), kernels.SPLAT_SIZE), dtype=np.float32)
         self._pairs = _PairBuffers(self._threads, capacity=1 << 16)
 
-    def render(self, camera: Camera, T_map_camera: np.ndarray) -> Render:
-        """Draw what `camera` (its distortion ignored) sees from the pose `T_map_camera` (4, 4)."""
-        pose = np.ascontiguousarray(T_map_camera, dtype=np.float64)
+    def _render(self, camera: Camera, T_splat_camera: np.ndarray) -> Render:
+        pose = np.ascontiguousarray(T_splat_camera, dtype=np.float64)
         with _LOCK:
             numba.set_num_threads(self._threads)
-            return self._render(camera, pose)
+            return self._draw(camera, pose)
 
-    def _render(self, camera: Camera, pose: np.ndarray) -> Render:
+    def _draw(self, camera: Camera, pose: np.ndarray) -> Render:
         tiles_x, tiles_y = -(-camera.width // kernels.TILE), -(-camera.height // kernels.TILE)
         histogram = np.empty((self._threads, tiles_x * tiles_y), dtype=np.int64)
         while True:
@@ -53,6 +54,7 @@ class CpuRenderer:
                 self._covariances,
                 self._opacities,
                 self._sh,
+                self._antialiased,
                 pose,
                 camera.K,
                 camera.width,

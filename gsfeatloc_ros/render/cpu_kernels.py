@@ -145,15 +145,18 @@ def _band_extent(a, b, c, r2, low, high):
 
 
 @njit(parallel=True, nogil=True, cache=True, fastmath=_MATH)
-def project(means, covariances, opacities, sh, pose, K, width, height, splats, pair_tiles, pair_splats, histogram):
+def project(
+    means, covariances, opacities, sh, antialiased, pose, K, width, height, splats, pair_tiles, pair_splats, histogram
+):
     """Project Gaussians and list the tiles that each touches.
 
     Each thread takes a run of Gaussians and writes its own segment of the pair lists and its own row of the histogram,
     in map order. A segment too small is left incomplete.
 
     Args:
-        means (N, 3), covariances (N, 6), opacities (N,), sh (N, C, 3): float32, map frame.
-        pose: (4, 4) float64 T_map_camera.
+        means (N, 3), covariances (N, 6), opacities (N,), sh (N, C, 3): float32, splat frame.
+        antialiased: dim each Gaussian as much as the blur widens it (Yu et al., "Mip-Splatting", 2024, eq. 9).
+        pose: (4, 4) float64 T_splat_camera.
         K: (3, 3) float64 intrinsics.
         splats: (N, SPLAT_SIZE) float32, written for the visible Gaussians.
         pair_tiles, pair_splats: (threads, capacity) int32, written.
@@ -205,20 +208,27 @@ def project(means, covariances, opacities, sh, pose, K, width, height, splats, p
                 sxy * ax + syy * ay + syz * az,
                 sxz * ax + syz * ay + szz * az,
             )
-            cov_xx = ax * vax + ay * vay + az * vaz + _EPS2D
+            cov_xx = ax * vax + ay * vay + az * vaz
             cov_xy = bx * vax + by * vay + bz * vaz
             cov_yy = (
                 bx * (sxx * bx + sxy * by + sxz * bz)
                 + by * (sxy * bx + syy * by + syz * bz)
                 + bz * (sxz * bx + syz * by + szz * bz)
-                + _EPS2D
             )
+            sharp_determinant = cov_xx * cov_yy - cov_xy * cov_xy
+            cov_xx, cov_yy = cov_xx + _EPS2D, cov_yy + _EPS2D
             determinant = cov_xx * cov_yy - cov_xy * cov_xy
             if not (determinant > _ZERO and determinant < _F(np.inf)):
                 continue
 
+            opacity = opacities[i]
+            if antialiased:
+                opacity *= math.sqrt(max(sharp_determinant / determinant, _ZERO))
+                if opacity < _MIN_ALPHA:
+                    continue
+
             # The ellipse in which alpha is at least 1/255.
-            r2 = _TWO * math.log(opacities[i] / _MIN_ALPHA)
+            r2 = _TWO * math.log(opacity / _MIN_ALPHA)
             reach_x, reach_y = math.sqrt(r2 * cov_xx), math.sqrt(r2 * cov_yy)
             if px + reach_x < _ZERO or px - reach_x > last_x or py + reach_y < _ZERO or py - reach_y > last_y:
                 continue
@@ -230,7 +240,7 @@ def project(means, covariances, opacities, sh, pose, K, width, height, splats, p
                 _TWO * b * _CONIC_SCALE,
                 c * _CONIC_SCALE,
             )
-            splat[LOG_OPACITY] = math.log2(opacities[i])
+            splat[LOG_OPACITY] = math.log2(opacity)
             splat[REACH_Y] = reach_y
             splat[DEPTH] = z
             inverse_distance = _ONE / math.sqrt(ox * ox + oy * oy + oz * oz)

@@ -19,35 +19,43 @@ from gsfeatloc_ros.render.base import (
     MIN_TRANSMITTANCE,
     NEAR_PLANE,
     Render,
+    SplatRenderer,
 )
 
 
-class ReferenceRenderer:
+class ReferenceRenderer(SplatRenderer):
     """Draws a map one Gaussian after another, front to back, in float64."""
 
     def __init__(self, gaussian_map: GaussianMap, background: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> None:
+        super().__init__(gaussian_map)
+        self._antialiased = gaussian_map.antialiased
         self._means = torch.from_numpy(gaussian_map.means).double()
         self._covariances = _covariances(gaussian_map)
         self._opacities = torch.from_numpy(gaussian_map.opacities).double()
         self._sh = torch.from_numpy(gaussian_map.sh).double()
         self._background = torch.tensor(background, dtype=torch.float64)
 
-    def render(self, camera: Camera, T_map_camera: np.ndarray) -> Render:
-        """Draw what `camera` (its distortion ignored) sees from the pose `T_map_camera` (4, 4)."""
-        rotation = torch.from_numpy(T_map_camera[:3, :3].T.copy()).double()  # map to camera
-        center = torch.from_numpy(T_map_camera[:3, 3].copy()).double()
+    def _render(self, camera: Camera, T_splat_camera: np.ndarray) -> Render:
+        rotation = torch.from_numpy(T_splat_camera[:3, :3].T.copy()).double()  # splat to camera
+        center = torch.from_numpy(T_splat_camera[:3, 3].copy()).double()
         offsets = self._means - center
         points = offsets @ rotation.T  # (N, 3) camera frame
-        pixels, covariances = _project(camera, points, rotation @ self._covariances @ rotation.T)
+        pixels, sharp_covariances = _project(camera, points, rotation @ self._covariances @ rotation.T)
+        covariances = sharp_covariances + EPS2D * torch.eye(2, dtype=torch.float64)
         colors = _colors(self._sh, offsets)
+        opacities = self._opacities
+        if self._antialiased:
+            # As much as the blur widens a Gaussian it dims it (Yu et al., "Mip-Splatting", 2024, eq. 9).
+            widening = torch.linalg.det(sharp_covariances) / torch.linalg.det(covariances)
+            opacities = opacities * torch.sqrt(widening.clamp(min=0.0))
 
         # The ellipse outside which alpha is under 1/255.
-        reach = torch.sqrt(2.0 * torch.log((self._opacities / MIN_ALPHA).clamp(min=1.0)))
+        reach = torch.sqrt(2.0 * torch.log((opacities / MIN_ALPHA).clamp(min=1.0)))
         radii = reach[:, None] * torch.sqrt(torch.diagonal(covariances, dim1=1, dim2=2))  # (N, 2) pixels
         low = torch.ceil(pixels - radii).clamp(min=0)
         high = torch.floor(pixels + radii)
         high = torch.minimum(high, torch.tensor([camera.width - 1, camera.height - 1]))
-        visible = (points[:, 2] > NEAR_PLANE) & (low <= high).all(dim=1) & (self._opacities >= MIN_ALPHA)
+        visible = (points[:, 2] > NEAR_PLANE) & (low <= high).all(dim=1) & (opacities >= MIN_ALPHA)
 
         rgb = torch.zeros(camera.height, camera.width, 3, dtype=torch.float64)
         moments = torch.zeros(camera.height, camera.width, 3, dtype=torch.float64)  # weight, weight z, weight z^2
@@ -65,7 +73,7 @@ class ReferenceRenderer:
             dx = torch.arange(x0, x1 + 1) - pixels[index, 0]
             dy = (torch.arange(y0, y1 + 1) - pixels[index, 1])[:, None]
             power = -0.5 * (conic[0, 0] * dx**2 + conic[1, 1] * dy**2) - conic[0, 1] * dx * dy
-            alpha = (self._opacities[index] * torch.exp(power)).clamp(max=MAX_ALPHA)
+            alpha = (opacities[index] * torch.exp(power)).clamp(max=MAX_ALPHA)
             after = transmittance[box] * (1.0 - alpha)
             drawn = running[box] & (alpha >= MIN_ALPHA)
             running[box] &= ~(drawn & (after <= MIN_TRANSMITTANCE))
@@ -103,7 +111,7 @@ def _covariances(gaussian_map: GaussianMap) -> torch.Tensor:
 
 
 def _project(camera: Camera, points: torch.Tensor, covariances: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Pixels (N, 2) and image covariances (N, 2, 2) of Gaussians in the camera frame (EWA splatting, eq. 29-31)."""
+    """Pixels (N, 2) and image covariances (N, 2, 2), not blurred, of Gaussians in the camera frame (EWA, eq. 29-31)."""
     (fx, _, cx), (_, fy, cy) = camera.K[0], camera.K[1]
     x, y, z = points.unbind(1)
     pixels = torch.stack([fx * x / z + cx, fy * y / z + cy], 1)
@@ -118,7 +126,7 @@ def _project(camera: Camera, points: torch.Tensor, covariances: torch.Tensor) ->
     jacobian = torch.stack(
         [torch.stack([fx / z, zero, -fx * tx / z**2], 1), torch.stack([zero, fy / z, -fy * ty / z**2], 1)], 1
     )
-    return pixels, jacobian @ covariances @ jacobian.transpose(1, 2) + EPS2D * torch.eye(2, dtype=torch.float64)
+    return pixels, jacobian @ covariances @ jacobian.transpose(1, 2)
 
 
 def _colors(sh: torch.Tensor, offsets: torch.Tensor) -> torch.Tensor:
