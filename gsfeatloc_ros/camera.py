@@ -85,6 +85,10 @@ class Camera:
         """Whether the lens is anything but a pinhole; a fisheye without coefficients is."""
         return self.model == "equidistant" or bool(self.distortion.any())
 
+    def pinhole(self) -> Camera:
+        """The camera with the same K that does not distort."""
+        return replace(self, distortion=np.zeros(0), model="plumb_bob")
+
     def undistort(self, pixels: np.ndarray) -> np.ndarray:
         """Move observed pixels (N, 2) to where a pinhole camera with the same K would see them: (N, 2) float64."""
         pixels = np.asarray(pixels, dtype=np.float64).reshape(-1, 2)

@@ -30,15 +30,16 @@ class Estimate:
         T_map_camera: (4, 4) float64 pose of the camera (optical axes) in the map frame; None unless LOCALIZED.
         covariance: (6, 6) float64 in ROS order (x y z, rotation about x y z), translation in map units, rotation in
             radians, both about the axes of the map frame at the camera centre; None unless LOCALIZED.
-        matches: number of 2D-2D matches of the final pass.
-        inliers: number of 2D-3D matches that agree with the pose.
+        matches: number of the photo's corners that were found in the last render; of matches where no pose was found.
+        inliers: number of those that have a depth and agree with the pose.
+        inlier_ratio: their share of those that have a depth; NaN without pose.
         coverage: share of the photo's cells, in a grid of 8 x 6, that hold an inlier.
         agreement: correlation of photo and render at the estimate (pose/acceptance.py); NaN where it cannot be said.
         reprojection_error: RMS of the inliers' reprojection errors in pixels of the localized image; NaN without pose.
-        passes: number of renders that were matched at the prior and the estimates.
-        views: number of other views that were searched.
+        passes: number of renders at estimates.
+        views: number of other views than the prior's that were searched.
         milliseconds: wall time of each stage by name, with "total".
-        correspondences: pixels of the inliers (photo, last render), photo pixels as observed (distorted).
+        correspondences: pixels of the inliers (photo, last render), of the photo without distortion.
         last_render: the last render that was matched, for pictures.
     """
 
@@ -48,6 +49,7 @@ class Estimate:
     covariance: np.ndarray | None = None
     matches: int = 0
     inliers: int = 0
+    inlier_ratio: float = float("nan")
     coverage: float = 0.0
     agreement: float = float("nan")
     reprojection_error: float = float("nan")

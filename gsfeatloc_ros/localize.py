@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from gsfeatloc_ros.camera import Camera
 from gsfeatloc_ros.estimate import Estimate, Status
-from gsfeatloc_ros.geometry import invert, so3_log, transform
-from gsfeatloc_ros.match.base import Features, Matcher
+from gsfeatloc_ros.geometry import so3_log
+from gsfeatloc_ros.match.base import Matcher
+from gsfeatloc_ros.match.track import CornerTracker
+from gsfeatloc_ros.photo import Photo
 from gsfeatloc_ros.pose.acceptance import agreement, coverage
 from gsfeatloc_ros.render.base import Renderer
-from gsfeatloc_ros.search import MIN_HINT, SEARCH_WIDTH, promising_poses, spread_poses
+from gsfeatloc_ros.search import CONFIRMED_HINT, MIN_HINT, SEARCH_WIDTH, STRONG_HINT, look, promising, spread_poses
 from gsfeatloc_ros.timing import StageClock
-from gsfeatloc_ros.view import MatchedView, match_view
+from gsfeatloc_ros.view import MatchedView, track_view
 
 
 @dataclass(frozen=True)
@@ -23,10 +27,10 @@ class LocalizerOptions:
 
     Attributes:
         max_image_width: wider photos are resized to this many pixels first.
-        max_passes: most renders that are matched: one at the prior, the others at the estimates.
-        max_reprojection_error: pixels, of the resized photo, within which a match agrees with a pose.
-        min_inliers: fewer 2D-3D matches that agree on the pose, in the render at the estimate, reject it.
-        min_inlier_ratio: as does a smaller share of inliers among the matches with a depth,
+        max_passes: most renders at estimates to which the photo is tracked.
+        max_reprojection_error: pixels, of the resized photo, within which a corner agrees with a pose.
+        min_inliers: fewer of the photo's corners that agree on the pose, in the render at the estimate, reject it.
+        min_inlier_ratio: as does a smaller share of inliers among the corners that were found and have a depth,
         min_coverage: inliers in a smaller share of the photo's cells (8 x 6),
         min_agreement: or a smaller correlation of the photo with the render at the estimate.
         max_deviation: as does a pose farther from the prior than this many standard deviations of it: a mirror image,
@@ -38,12 +42,12 @@ class LocalizerOptions:
     """
 
     max_image_width: int = 640
-    max_passes: int = 3
+    max_passes: int = 4
     max_reprojection_error: float = 3.0
     min_inliers: int = 20
-    min_inlier_ratio: float = 0.3
+    min_inlier_ratio: float = 0.88
     min_coverage: float = 0.1
-    min_agreement: float = 0.6
+    min_agreement: float = 0.3
     max_deviation: float = 8.0
     max_views: int = 32
     prior_rotation: float = 15.0
@@ -56,13 +60,8 @@ class LocalizerOptions:
         return np.diag(np.square(sigmas))
 
 
-# A pass that moves what the camera sees by less than this many pixels has settled.
-_SETTLED_PIXELS = 0.1
-# The render at the prior is seen from elsewhere, and errors of its depth matter the more the farther off it is: there,
-# matches agree with a pose within this many times the reprojection error.
-_FIRST_LOOSENESS = 2.0
-# Views differ a little in what can be matched: fewer inliers than this share of the last pass's are worse.
-_WORSE = 0.9
+# A render nearer to the photo than this many pixels is at the estimate.
+_SETTLED_PIXELS = 1.0
 # What a prior's covariance is taken to be at least, as a share of that of a prior without one.
 _LEAST_SHARE_OF_USUAL = 0.01
 # Views are searched in batches of this many; the best of each are followed before the next is rendered.
@@ -70,10 +69,13 @@ _BATCH = 8
 
 
 class Localizer:
-    """Finds where a photo was taken: renders the map, matches, lifts to 3D, solves; then again from the estimate.
+    """Finds where a photo was taken, in two steps.
 
-    The render at the estimate is the judge of the estimate: what the map predicts there must match the photo. Where the
-    prior leads to no answer, views around it are searched for a better start.
+    First features: a small render at the prior is matched with the photo, the matches are lifted to 3D by the render's
+    depth and solved for the pose. Where that leads to no answer, views around the prior are tried. Then pixels: the
+    photo's corners are tracked to a render at the estimate, lifted and solved, until the render is where the photo is.
+
+    That last render is the judge of the estimate: what the map predicts there must match the photo.
     """
 
     def __init__(self, renderer: Renderer, matcher: Matcher, options: LocalizerOptions | None = None) -> None:
@@ -112,66 +114,98 @@ class Localizer:
         if np.shape(prior_covariance) != (6, 6) or not np.isfinite(prior_covariance).all():
             raise ValueError("the prior's covariance must be a finite 6x6 matrix")
         clock = StageClock()
-        image, camera = camera.limit(image, self._options.max_image_width)
-        with clock.stage("features"):
-            features = self._matcher.features(image)
+        with clock.stage("prepare"):
+            photo = Photo.undistorted(image, camera, self._options.max_image_width)
         prior = np.asarray(T_map_camera_prior, dtype=np.float64)
-        query = _Query(image, camera, features, prior, np.asarray(prior_covariance, dtype=np.float64), clock)
-        estimate = self._refine(query, prior)
-        if not estimate.localized and self._options.max_views and len(features) >= MIN_HINT:
-            estimate = self._search(query, estimate)
-        return replace(estimate, milliseconds=clock.milliseconds())
+        query = _Query(photo, prior, np.asarray(prior_covariance, dtype=np.float64), clock)
+        return replace(self._search(query), milliseconds=clock.milliseconds())
+
+    def _search(self, query: _Query) -> Estimate:
+        """Match small views of the map, first at the prior, then around it, and refine what they suggest."""
+        options, clock = self._options, query.clock
+        with clock.stage("features"):
+            small = query.photo.limited(SEARCH_WIDTH)
+            features = self._matcher.features(small.image)
+        if len(features) < MIN_HINT:
+            return Estimate(
+                Status.FAILED, f"{len(features)} features in the photo: is it too dark, too bright or out of focus?"
+            )
+
+        def look_from(poses: list[np.ndarray]) -> list[MatchedView]:
+            max_error, seed = options.max_reprojection_error, options.seed
+            return look(self._renderer, self._matcher, features, small.camera, poses, max_error, seed, clock)
+
+        seen: list[MatchedView] = []
+        rejected: Estimate | None = None
+        for batch in self._batches(query):
+            looked = look_from(batch)
+            seen += looked
+            for view in promising(looked):
+                if view.inliers < STRONG_HINT:
+                    view = look_from([view.solution.T_map_camera])[0]
+                    if view.inliers < CONFIRMED_HINT:
+                        continue
+                estimate = self._refine(query, view.solution.T_map_camera)
+                if estimate.localized:
+                    return replace(estimate, views=len(seen) - 1)
+                rejected = rejected or estimate
+        return replace(rejected or _nothing_in_common(len(features), seen), views=len(seen) - 1)
+
+    def _batches(self, query: _Query) -> Iterator[list[np.ndarray]]:
+        """Poses (4, 4) to look from: the prior alone, then those around it, a few at a time."""
+        yield [query.prior]
+        poses = spread_poses(query.prior, query.prior_covariance, self._options.max_views, self._options.seed)
+        for start in range(0, len(poses), _BATCH):
+            yield poses[start : start + _BATCH]
 
     def _refine(self, query: _Query, pose: np.ndarray) -> Estimate:
-        """Render and solve at `pose`, then at each estimate, until it settles; then judge."""
-        options = self._options
-        best: MatchedView | None = None
-        for number in range(1, options.max_passes + 1):
-            max_error = options.max_reprojection_error * (_FIRST_LOOSENESS if number == 1 else 1.0)
-            current = match_view(
-                self._renderer, self._matcher, query.features, query.camera, pose, max_error, options.seed, query.clock
+        """Render and track at `pose`, then at each estimate, until the render is where the photo is; then judge."""
+        options, camera = self._options, query.photo.camera
+        passes, settled = 0, False
+        while passes < options.max_passes and not settled:
+            view = track_view(
+                self._renderer, query.tracker, camera, pose, options.max_reprojection_error, options.seed, query.clock
             )
-            if number > 2 and current.inliers < _WORSE * best.inliers:
+            passes += 1
+            if view.solution is None:
                 break
-            settled = number > 1 and current.solution and _moved(query.camera, best, current) < _SETTLED_PIXELS
-            best = current
-            if settled or current.inliers < MIN_HINT:
-                break
-            pose = current.solution.T_map_camera
+            settled = view.offset(camera) < _SETTLED_PIXELS
+            pose = view.solution.T_map_camera
         with query.clock.stage("judge"):
-            return self._judge(query, best, number)
+            return self._judge(query, view, passes)
 
     def _judge(self, query: _Query, view: MatchedView, passes: int) -> Estimate:
         """Believe the pose that the last view gave, or say why not."""
-        options, camera = self._options, query.camera
-        where = "prior" if passes == 1 else "estimate"
+        options, camera = self._options, query.photo.camera
         counts = (
-            f"{len(query.features)} features in the photo, {view.matches} matches, {len(view.points)} with depth, "
-            f"{view.inliers} inliers"
+            f"{len(query.tracker.corners)} corners in the photo, {view.matches} found in the render, "
+            f"{len(view.points)} with depth, {view.inliers} inliers"
         )
         evidence = Estimate(
-            Status.FAILED if passes == 1 else Status.REJECTED,
-            f"photo and render at the {where} have nothing in common: {counts}",
+            Status.REJECTED,
+            f"the pose found is not believed: photo and render at the estimate have nothing in common: {counts}",
             matches=view.matches,
             inliers=view.inliers,
             passes=passes,
             last_render=view.render,
         )
-        if view.inliers < MIN_HINT:
+        if view.solution is None:
             return evidence
         pose = view.solution.T_map_camera
         evidence = replace(
             evidence,
-            status=Status.REJECTED,
+            inlier_ratio=view.inliers / len(view.points),
             coverage=coverage(view.correspondences.a, camera.width, camera.height),
-            agreement=agreement(query.image, camera, view.render),
+            agreement=agreement(query.photo, view.render),
             reprojection_error=view.solution.reprojection_error,
+            correspondences=view.correspondences,
         )
-        needed = max(options.min_inliers, int(np.ceil(options.min_inlier_ratio * len(view.points))))
         deviation = query.deviation(pose, options.prior_covariance())
         doubt = ""
-        if view.inliers < needed:
-            doubt = f"{counts} (at least {needed} needed)"
+        if view.inliers < options.min_inliers:
+            doubt = f"{counts} (at least {options.min_inliers} needed)"
+        elif evidence.inlier_ratio < options.min_inlier_ratio:
+            doubt = f"{counts}: a share of {evidence.inlier_ratio:.2f} (at least {options.min_inlier_ratio:g} needed)"
         elif evidence.coverage < options.min_coverage:
             doubt = f"inliers in {evidence.coverage:.0%} of the photo (at least {options.min_coverage:.0%} needed)"
         elif not evidence.agreement >= options.min_agreement:
@@ -185,47 +219,25 @@ class Localizer:
         return replace(
             evidence,
             status=Status.LOCALIZED,
-            reason=f"{view.inliers} inliers of {view.matches} matches, correlation {evidence.agreement:.2f}",
+            reason=f"{view.inliers} inliers of {len(view.points)} corners, correlation {evidence.agreement:.2f}",
             T_map_camera=pose,
             covariance=view.solution.covariance,
-            correspondences=view.correspondences,
         )
-
-    def _search(self, query: _Query, failure: Estimate) -> Estimate:
-        """Start again from other views round the prior; `failure` where none of them leads to an answer."""
-        options = self._options
-        image, camera = query.camera.limit(query.image, SEARCH_WIDTH)
-        with query.clock.stage("features"):
-            features = self._matcher.features(image)
-        poses = spread_poses(query.prior, query.prior_covariance, options.max_views, options.seed)
-        for start in range(0, len(poses), _BATCH):
-            batch = poses[start : start + _BATCH]
-            for pose in promising_poses(
-                self._renderer,
-                self._matcher,
-                features,
-                camera,
-                batch,
-                options.max_reprojection_error,
-                options.seed,
-                query.clock,
-            ):
-                estimate = self._refine(query, pose)
-                if estimate.localized:
-                    return replace(estimate, views=start + len(batch))
-        return replace(failure, views=len(poses))
 
 
 @dataclass(frozen=True, eq=False)
 class _Query:
-    """What is asked: a photo (resized) with its camera and features, a prior (4, 4) with its covariance (6, 6)."""
+    """What is asked: a photo, a prior (4, 4) with its covariance (6, 6)."""
 
-    image: np.ndarray
-    camera: Camera
-    features: Features
+    photo: Photo
     prior: np.ndarray
     prior_covariance: np.ndarray
     clock: StageClock
+
+    @cached_property
+    def tracker(self) -> CornerTracker:
+        """Of the photo; made when there is an estimate to track from."""
+        return CornerTracker(self.photo)
 
     def deviation(self, pose: np.ndarray, usual_covariance: np.ndarray) -> float:
         """Mahalanobis distance of a pose (4, 4) from the prior.
@@ -238,8 +250,15 @@ class _Query:
         return float(np.sqrt(max(step @ np.linalg.solve(covariance, step), 0.0)))
 
 
-def _moved(camera: Camera, before: MatchedView, after: MatchedView) -> float:
-    """Median distance in pixels by which the two solutions' projections of the later one's inliers differ."""
-    points = after.points[after.solution.inliers]
-    seen = [camera.project(transform(invert(v.solution.T_map_camera), points)) for v in (before, after)]
-    return float(np.median(np.linalg.norm(seen[0] - seen[1], axis=1)))
+def _nothing_in_common(features: int, views: list[MatchedView]) -> Estimate:
+    """None of the views, of which the first is the prior's, suggested a pose."""
+    best = max(views, key=lambda view: view.inliers)
+    where = "at the prior" if len(views) == 1 else f"at the prior and in {len(views) - 1} views around it"
+    return Estimate(
+        Status.FAILED,
+        f"photo and renders {where} have nothing in common: {features} features in the photo, at best {best.matches} "
+        f"matches, {len(best.points)} with depth, {best.inliers} inliers",
+        matches=best.matches,
+        inliers=best.inliers,
+        last_render=best.render,
+    )

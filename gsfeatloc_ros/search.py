@@ -1,4 +1,4 @@
-"""Where to look when the map seen from the prior has nothing in common with the photo."""
+"""Where to look for the photo: at the prior, and round it if the map seen from there has nothing in common with it."""
 
 from __future__ import annotations
 
@@ -9,11 +9,14 @@ from gsfeatloc_ros.geometry import make_pose, so3_exp
 from gsfeatloc_ros.match.base import Features, Matcher
 from gsfeatloc_ros.render.base import Renderer
 from gsfeatloc_ros.timing import StageClock
-from gsfeatloc_ros.view import match_view
+from gsfeatloc_ros.view import MatchedView, match_view
 
-# Matches that agree on a pose, by which a view suggests it. The render at that pose then is the judge.
+# Matches that agree on a pose, by which a view suggests it. Chance makes some agree too: the map is looked at from the
+# pose of a hint that is not strong, and has to confirm it.
 MIN_HINT = 8
-# Views are compared with the photo at this width, which is cheap and enough to tell which is worth more.
+STRONG_HINT = 50
+CONFIRMED_HINT = 12
+# Views are matched with the photo at this width: it is cheap, and what it finds is refined afterwards.
 SEARCH_WIDTH = 320
 # Of the views that are looked at together, the best of this many are followed.
 _FOLLOWED = 2
@@ -23,7 +26,7 @@ _DRAWN = 16
 _REACH = 3.26
 
 
-def promising_poses(
+def look(
     renderer: Renderer,
     matcher: Matcher,
     query: Features,
@@ -32,22 +35,28 @@ def promising_poses(
     max_error: float,
     seed: int,
     clock: StageClock,
-) -> list[np.ndarray]:
-    """Look at the map from `poses`, in small renders, and say what poses (4, 4) of the photo that suggests, best first.
+) -> list[MatchedView]:
+    """Look at the map from `poses`, in small renders, and sort the views by what they have in common with the photo.
 
     Args:
         renderer, matcher: of the map and of features.
         query: features of the photo, resized to at most SEARCH_WIDTH.
-        camera: of the photo at that size.
+        camera: of the photo at that size, without distortion.
         poses: (4, 4) each, T_map_camera of the views.
         max_error: reprojection error in pixels of the small image up to which a match agrees with a pose.
         seed: of RANSAC.
         clock: on which the stages of the views are counted.
+
+    Returns:
+        The views, those with the most inliers first.
     """
     views = [match_view(renderer, matcher, query, camera, pose, max_error, seed, clock) for pose in poses]
-    hints = [view for view in views if view.inliers >= MIN_HINT]
-    hints.sort(key=lambda view: view.inliers, reverse=True)
-    return [view.solution.T_map_camera for view in hints[:_FOLLOWED]]
+    return sorted(views, key=lambda view: view.inliers, reverse=True)
+
+
+def promising(views: list[MatchedView]) -> list[MatchedView]:
+    """Of views that were looked at together and sorted, those whose poses of the photo are worth following."""
+    return [view for view in views[:_FOLLOWED] if view.inliers >= MIN_HINT]
 
 
 def spread_poses(T_map_camera: np.ndarray, covariance: np.ndarray, count: int, seed: int) -> list[np.ndarray]:

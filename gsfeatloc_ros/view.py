@@ -7,7 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsfeatloc_ros.camera import Camera
+from gsfeatloc_ros.geometry import invert, transform
 from gsfeatloc_ros.match.base import Features, Matcher, Matches
+from gsfeatloc_ros.match.track import CornerTracker
 from gsfeatloc_ros.pose.lift import lift
 from gsfeatloc_ros.pose.solve import PoseSolution, solve_pose
 from gsfeatloc_ros.render.base import Render, Renderer
@@ -19,13 +21,15 @@ class MatchedView:
     """A view, matched with the photo and solved.
 
     Attributes:
+        pose: (4, 4) T_map_camera of the view.
         render: the map as seen there.
-        matches: how many the matcher found.
+        matches: how many pixels of the photo were found in the render.
         lifted_matches: those whose render pixel has a depth.
         points: (M, 3) map points of `lifted_matches`.
         solution: the photo's pose from them, None where they agree on none.
     """
 
+    pose: np.ndarray
     render: Render
     matches: int
     lifted_matches: Matches
@@ -42,6 +46,15 @@ class MatchedView:
         """The matches (inliers) that agree with the solution, which must exist."""
         return self.lifted_matches.select(self.solution.inliers)
 
+    def offset(self, camera: Camera) -> float:
+        """How far, in pixels, this view is from the photo's: the median distance between the inliers here and there.
+
+        The solution must exist.
+        """
+        points = self.points[self.solution.inliers]
+        here, there = (camera.project(transform(invert(T), points)) for T in (self.pose, self.solution.T_map_camera))
+        return float(np.median(np.linalg.norm(here - there, axis=1)))
+
 
 def match_view(
     renderer: Renderer,
@@ -53,12 +66,12 @@ def match_view(
     seed: int,
     clock: StageClock,
 ) -> MatchedView:
-    """Render the map at `pose`, match the render with the photo, lift the matches and solve for the photo's pose.
+    """Render the map at `pose`, match its features with the photo's, lift the matches and solve for the photo's pose.
 
     Args:
         renderer, matcher: of the map and of features.
-        query: features of the photo, as observed (distorted).
-        camera: of the photo; the render is a pinhole camera's with the same K.
+        query: features of the photo.
+        camera: of the photo, without distortion.
         pose: (4, 4) T_map_camera of the view.
         max_error: reprojection error in pixels up to which a match agrees with a pose.
         seed: of RANSAC.
@@ -70,9 +83,32 @@ def match_view(
         features = matcher.features(render.image())
     with clock.stage("match"):
         matches = matcher.match(query, features)
+    return _solve_view(render, matches, camera, pose, max_error, seed, clock)
+
+
+def track_view(
+    renderer: Renderer,
+    tracker: CornerTracker,
+    camera: Camera,
+    pose: np.ndarray,
+    max_error: float,
+    seed: int,
+    clock: StageClock,
+) -> MatchedView:
+    """The same where `pose` is nearly the photo's: the photo's corners are tracked to the render, not matched."""
+    with clock.stage("render"):
+        render = renderer.render(camera, pose)
+    with clock.stage("track"):
+        matches = tracker.track(render.image())
+    return _solve_view(render, matches, camera, pose, max_error, seed, clock)
+
+
+def _solve_view(
+    render: Render, matches: Matches, camera: Camera, pose: np.ndarray, max_error: float, seed: int, clock: StageClock
+) -> MatchedView:
     with clock.stage("solve"):
         lifted = lift(render, camera, pose, matches.b)
         lifted_matches = matches.select(lifted.valid)
         points, sigmas = lifted.points[lifted.valid], lifted.sigmas[lifted.valid]
-        solution = solve_pose(camera, camera.undistort(lifted_matches.a), points, sigmas, max_error, seed)
-    return MatchedView(render, len(matches), lifted_matches, points, solution)
+        solution = solve_pose(camera, lifted_matches.a, points, sigmas, max_error, seed)
+    return MatchedView(pose, render, len(matches), lifted_matches, points, solution)

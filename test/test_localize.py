@@ -46,10 +46,19 @@ def test_the_answer_carries_its_evidence(sift_localizer, room_camera, room_queri
     assert 20 <= estimate.inliers <= estimate.matches
     assert len(estimate.correspondences) == estimate.inliers
     assert 0 < estimate.reprojection_error < 3.0
-    assert 2 <= estimate.passes <= 3
+    assert 1 <= estimate.passes <= 4
     assert 0.5 < estimate.agreement <= 1.0
     assert 0.5 < estimate.coverage <= 1.0
-    assert {"features", "render", "match", "solve", "judge", "total"} <= estimate.milliseconds.keys()
+    assert {
+        "prepare",
+        "features",
+        "render",
+        "match",
+        "track",
+        "solve",
+        "judge",
+        "total",
+    } <= estimate.milliseconds.keys()
     stages = sum(ms for stage, ms in estimate.milliseconds.items() if stage != "total")
     assert stages <= estimate.milliseconds["total"]
 
@@ -126,7 +135,7 @@ def test_the_render_at_the_estimate_is_the_judge(renderer, room_camera, room_que
         assert estimate.status is Status.REJECTED
         assert_no_answer(estimate)
         assert says in estimate.reason
-        assert estimate.passes > 1
+        assert estimate.passes >= 1
 
 
 def test_distortion_is_taken_out(sift_localizer, room_camera, room_queries) -> None:

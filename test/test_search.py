@@ -11,9 +11,11 @@ from gsfeatloc_ros.estimate import Status
 from gsfeatloc_ros.geometry import make_pose, rotation_error_deg, so3_exp, so3_log, translation_error
 from gsfeatloc_ros.localize import Localizer, LocalizerOptions
 from gsfeatloc_ros.match import create_matcher
+from gsfeatloc_ros.photo import Photo
 from gsfeatloc_ros.render import create_renderer
-from gsfeatloc_ros.search import SEARCH_WIDTH, promising_poses, spread_poses
+from gsfeatloc_ros.search import SEARCH_WIDTH, look, promising, spread_poses
 from gsfeatloc_ros.timing import StageClock
+from gsfeatloc_ros.view import MatchedView
 
 POSE = make_pose(so3_exp(np.array([0.3, -0.2, 1.0])), np.array([1.0, 2.0, 3.0]))
 
@@ -71,11 +73,11 @@ def renderer(room_map):
     return create_renderer(room_map)
 
 
-def look(renderer, camera, image: np.ndarray, views: list[np.ndarray]) -> list[np.ndarray]:
-    """What the views suggest of a photo."""
+def seen(renderer, camera, image: np.ndarray, views: list[np.ndarray]) -> list[MatchedView]:
+    """The views of the map from some poses, beside a photo."""
     matcher = create_matcher("sift")
-    small, small_camera = camera.limit(image, SEARCH_WIDTH)
-    return promising_poses(renderer, matcher, matcher.features(small), small_camera, views, 3.0, 0, StageClock())
+    small = Photo.undistorted(image, camera, SEARCH_WIDTH)
+    return look(renderer, matcher, matcher.features(small.image), small.camera, views, 3.0, 0, StageClock())
 
 
 def turned(pose: np.ndarray, degrees: float) -> np.ndarray:
@@ -83,20 +85,23 @@ def turned(pose: np.ndarray, degrees: float) -> np.ndarray:
     return pose @ make_pose(so3_exp(np.radians([0.0, degrees, 0.0])), np.zeros(3))
 
 
-def test_promising_poses_come_best_first_from_the_views_that_share_something(
-    renderer, room_camera, room_queries
-) -> None:
+def test_views_that_share_something_with_the_photo_come_first(renderer, room_camera, room_queries) -> None:
     truth = room_queries[0].T_map_camera
-    views = [turned(truth, 180), turned(truth, 20), turned(truth, 5)]
-    found = look(renderer, room_camera, room_queries[0].image, views)
-    assert len(found) == 2
-    for pose in found:
-        assert rotation_error_deg(pose, truth) < 2.0
-        assert translation_error(pose, truth) < 0.1
+    poses = [turned(truth, 180), turned(truth, 20), turned(truth, 5)]
+    views = seen(renderer, room_camera, room_queries[0].image, poses)
+    np.testing.assert_array_equal(views[-1].pose, poses[0])
+    assert views[0].inliers >= views[1].inliers > views[2].inliers
+    followed = promising(views)
+    assert len(followed) == 2
+    for view in followed:
+        assert rotation_error_deg(view.solution.T_map_camera, truth) < 2.0
+        assert translation_error(view.solution.T_map_camera, truth) < 0.1
 
 
-def test_no_views_no_poses(renderer, room_camera, room_queries) -> None:
-    assert look(renderer, room_camera, room_queries[0].image, []) == []
+def test_views_that_share_nothing_are_not_followed(renderer, room_camera, room_queries) -> None:
+    truth = room_queries[0].T_map_camera
+    assert promising(seen(renderer, room_camera, room_queries[0].image, [turned(truth, 180)])) == []
+    assert promising(seen(renderer, room_camera, room_queries[0].image, [])) == []
 
 
 def test_finds_a_camera_that_was_turned_away(renderer, room_camera, room_queries) -> None:

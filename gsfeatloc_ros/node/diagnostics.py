@@ -20,8 +20,12 @@ def evidence(estimate: Estimate) -> dict[str, str]:
     return {
         "matches": str(estimate.matches),
         "inliers": str(estimate.inliers),
+        "inlier_ratio": f"{estimate.inlier_ratio:.3f}",
+        "coverage": f"{estimate.coverage:.3f}",
+        "agreement": f"{estimate.agreement:.3f}",
         "reprojection_error_px": f"{estimate.reprojection_error:.3f}",
         "passes": str(estimate.passes),
+        "views": str(estimate.views),
         **{f"ms_{stage}": f"{duration:.1f}" for stage, duration in estimate.milliseconds.items()},
     }
 

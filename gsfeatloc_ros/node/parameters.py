@@ -59,12 +59,12 @@ PARAMETERS = (
     Parameter("renderer.device", "auto", "Where to render: cpu, or auto to choose."),
     Parameter("renderer.threads", 0, "Threads of the CPU renderer; 0 takes all cores.", (0, 1024)),
     _option("max_image_width", "Wider images are resized to this many pixels first.", (64, 16384)),
-    _option("max_passes", "Most renders matched for one image: one at the prior, the others at estimates.", (1, 20)),
+    _option("max_passes", "Most renders at estimates to which an image is tracked.", (1, 20)),
     _option(
-        "max_reprojection_error", "Pixels of the resized image within which a match agrees with a pose.", (0.1, 50.0)
+        "max_reprojection_error", "Pixels of the resized image within which a corner agrees with a pose.", (0.1, 50.0)
     ),
-    _option("min_inliers", "With fewer 2D-3D matches that agree on a pose there is no answer.", (4, 100000)),
-    _option("min_inlier_ratio", "With a smaller share of inliers among the matches there is no answer.", (0.0, 1.0)),
+    _option("min_inliers", "With fewer tracked corners that agree on a pose there is no answer.", (4, 100000)),
+    _option("min_inlier_ratio", "With a smaller share of inliers among those corners there is no answer.", (0.0, 1.0)),
     _option(
         "min_coverage", "With inliers in a smaller share of the image's 8 x 6 cells there is no answer.", (0.0, 1.0)
     ),

@@ -5,8 +5,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from gsfeatloc_ros.camera import Camera
+from gsfeatloc_ros.photo import Photo
 from gsfeatloc_ros.render.base import Render
+from gsfeatloc_ros.structure import local_structure
 
 # The photo is divided into this many cells across and down.
 _CELLS = (8, 6)
@@ -16,8 +17,9 @@ _COMPARED_WIDTH = 320
 _NEIGHBOURHOOD = 6.0
 # Contrast (of 255) under which a neighbourhood says nothing: sky, a blank wall.
 _MIN_CONTRAST = 2.0
-# Pixels that are compared must be covered by the map.
+# Pixels that are compared must be covered by the map, and seen by the lens.
 _MIN_ALPHA = 0.9
+_MIN_COVERED = 0.5
 _MIN_COMPARED_SHARE = 0.05
 
 
@@ -28,36 +30,27 @@ def coverage(pixels: np.ndarray, width: int, height: int) -> float:
     return len(np.unique(rows * _CELLS[0] + columns)) / (_CELLS[0] * _CELLS[1])
 
 
-def agreement(image: np.ndarray, camera: Camera, render: Render) -> float:
+def agreement(photo: Photo, render: Render) -> float:
     """Correlation, in [-1, 1], of the photo with the map's render at the estimate.
 
-    Both are reduced to the local structure of the brightness, each neighbourhood normalised by its mean and contrast,
-    so that exposure, shading and colour balance do not count. NaN where too little of the photo has structure that the
-    map covers.
+    Both are reduced to their local structure, so that exposure, shading and colour balance do not count. NaN where too
+    little of the photo has structure that the map covers.
 
     Args:
-        image: (H, W, 3) uint8 RGB, as observed by `camera` (distorted).
-        camera: of the photo.
-        render: (H, W), drawn with the same K at the estimate.
+        photo: without distortion.
+        render: of the same size, drawn with the same K at the estimate.
     """
-    image = camera.undistort_image(image)
+    camera = photo.camera
     size = (_COMPARED_WIDTH, max(1, round(_COMPARED_WIDTH * camera.height / camera.width)))
-    covered = cv2.resize(render.alpha, size, interpolation=cv2.INTER_AREA) >= _MIN_ALPHA
-    (photo, photo_contrast), (map_, map_contrast) = (
-        _local_structure(cv2.resize(cv2.cvtColor(i, cv2.COLOR_RGB2GRAY), size, interpolation=cv2.INTER_AREA))
-        for i in (image, render.image())
+    covered = photo.seen & (render.alpha >= _MIN_ALPHA)
+    covered = cv2.resize(covered.astype(np.float32), size, interpolation=cv2.INTER_AREA) > _MIN_COVERED
+    (photo_structure, photo_contrast), (map_structure, map_contrast) = (
+        local_structure(cv2.resize(gray, size, interpolation=cv2.INTER_AREA), _NEIGHBOURHOOD, _MIN_CONTRAST)
+        for gray in (photo.gray(), cv2.cvtColor(render.image(), cv2.COLOR_RGB2GRAY))
     )
     compared = covered & (np.maximum(photo_contrast, map_contrast) >= _MIN_CONTRAST)
     if compared.mean() < _MIN_COMPARED_SHARE:
         return float("nan")
-    photo, map_ = photo[compared], map_[compared]
-    norm = np.sqrt((photo**2).sum() * (map_**2).sum())
-    return float((photo * map_).sum() / norm) if norm > 0 else float("nan")
-
-
-def _local_structure(gray: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Brightness (H, W) less its local mean over its local deviation, and that deviation."""
-    gray = gray.astype(np.float32)
-    centred = gray - cv2.GaussianBlur(gray, (0, 0), _NEIGHBOURHOOD)
-    contrast = np.sqrt(cv2.GaussianBlur(centred**2, (0, 0), _NEIGHBOURHOOD))
-    return centred / np.maximum(contrast, _MIN_CONTRAST), contrast
+    a, b = photo_structure[compared], map_structure[compared]
+    norm = np.sqrt((a**2).sum() * (b**2).sum())
+    return float((a * b).sum() / norm) if norm > 0 else float("nan")

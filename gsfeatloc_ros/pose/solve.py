@@ -20,7 +20,7 @@ MIN_POINTS = 4
 _MIN_PIXEL_SIGMA = 0.1
 _REFINE_ITERATIONS = 20
 # In standard deviations. Real residuals have longer tails than a Gaussian's, so the loss is narrow.
-_CAUCHY_SCALE = 1.0
+CAUCHY_SCALE = 1.0
 # What matches have in common (errors of the map, of its poses, of the calibration) does not average out over them: an
 # error of this many pixels that all share. Fitted on real photos; docs/trust.md.
 _SHARED_PIXEL_SIGMA = 0.1
@@ -133,7 +133,7 @@ def refine_pose(
     whitening = _whitening(residuals, _apply(point_jacobian, sigmas))
 
     def cost(residuals: np.ndarray) -> float:
-        return float(np.log1p((_apply(whitening, residuals) ** 2).sum(axis=1) / _CAUCHY_SCALE**2).sum())
+        return float(np.log1p((_apply(whitening, residuals) ** 2).sum(axis=1) / CAUCHY_SCALE**2).sum())
 
     current = cost(residuals)
     for _ in range(_REFINE_ITERATIONS):
@@ -204,7 +204,7 @@ def _normal_equations(whitening: np.ndarray, residuals: np.ndarray, jacobian: np
 
 def _cauchy_weights(squared: np.ndarray) -> np.ndarray:
     """Weights (M,) of residuals by their squared whitened lengths (M,)."""
-    return 1.0 / (1.0 + squared / _CAUCHY_SCALE**2)
+    return 1.0 / (1.0 + squared / CAUCHY_SCALE**2)
 
 
 def _whitening(residuals: np.ndarray, smears: np.ndarray) -> np.ndarray:

@@ -12,7 +12,7 @@ import numpy as np
 from gsfeatloc_ros.camera import Camera
 from gsfeatloc_ros.estimate import Estimate
 from gsfeatloc_ros.evaluate.metrics import QueryResult
-from gsfeatloc_ros.evaluate.pictures import draw_matches, side_by_side
+from gsfeatloc_ros.evaluate.pictures import mark_matches, side_by_side
 from gsfeatloc_ros.evaluate.run import Task, localize, open_renderer, open_scene
 from gsfeatloc_ros.evaluate.tables import RunResults
 from gsfeatloc_ros.geometry import invert, transform
@@ -23,6 +23,7 @@ _MOST = 6
 _LEAST = 3  # are shown even when all is well
 _WIDTH = 420  # pixels of each picture
 _JPEG_QUALITY = 85
+_NO_VIEW = 235  # grey level
 # Depths that differ by less than this share are those of the same surface.
 _SAME_DEPTH = 0.1
 
@@ -33,8 +34,8 @@ class WorstQuery:
 
     Attributes:
         task, result: what was asked and what came out.
-        picture: the map at the prior, the photo, and the last view of the map that was matched with it, as a data URL
-            of a JPEG, with lines between inliers.
+        picture: the photo without distortion, the map at the prior, and the last view of the map that was compared with
+            the photo, as a data URL of a JPEG; inliers have rings of one colour in the first and the last.
         seen_at_prior: share of what the photo shows of the map that is in view from the prior.
     """
 
@@ -62,12 +63,13 @@ def _look(task: Task, result: QueryResult) -> WorstQuery:
     truth_render = renderer.render(localized, photo.T_map_camera)
     view = _last_view(renderer, localized, estimate)
     size = localized.limited(_WIDTH)
-    pictures = [_resized(image, size) for image in (prior_render.image(), scene.read_photo(photo))]
-    if view is None:
-        strip = side_by_side([*pictures, np.full_like(pictures[0], 235)])
-    else:
+    image = photo.camera.undistort_image(scene.read_photo(photo))
+    left, middle = (_resized(picture, size) for picture in (image, prior_render.image()))
+    right = np.full_like(left, _NO_VIEW)
+    if view is not None:
         matches = _scaled(estimate.correspondences, localized, size)
-        strip = side_by_side([pictures[0], draw_matches(pictures[1], _resized(view.image(), size), matches)])
+        left, right = mark_matches(left, _resized(view.image(), size), matches)
+    strip = side_by_side([left, middle, right])
     seen = _share_in_view(localized, truth_render, photo.T_map_camera, prior_render, task.prior.T_map_camera)
     return WorstQuery(task, result, _data_url(strip), seen)
 

@@ -1,0 +1,74 @@
+"""Following the corners of a photo into renders of nearly the same view."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from gsfeatloc_ros.match.base import Matches
+from gsfeatloc_ros.photo import Photo
+from gsfeatloc_ros.structure import local_structure
+
+# Corners (Shi and Tomasi, 1994): at most this many, at least so many pixels apart, and of at least this share of the
+# strongest one's strength.
+_MAX_CORNERS = 800
+_DISTANCE = 7
+_QUALITY = 0.005
+_CORNER_BLOCK = 5
+# The images that are compared: local structure, its zero in the middle of the range of a byte.
+_NEIGHBOURHOOD = 12.0
+_MIN_CONTRAST = 8.0
+_GAIN = 40.0
+# Lucas-Kanade on a pyramid of four levels.
+_WINDOW = (15, 15)
+_LEVELS = 3
+_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.01)
+# A corner that is followed to the render and back must return to within this many pixels.
+_MAX_RETURN_ERROR = 1.0
+
+
+class CornerTracker:
+    """Finds where the corners of a photo are in renders, by optical flow (Lucas and Kanade, 1981; Bouguet, 2001).
+
+    Where photo and render nearly coincide this is cheaper and more accurate than matching features: pixels are compared
+    with pixels, all over the image. Both are reduced to their local structure first, as a map does not know today's
+    light.
+
+    Attributes:
+        corners: (N, 2) float32 pixels of the photo.
+    """
+
+    def __init__(self, photo: Photo) -> None:
+        gray = photo.gray()
+        self._structure = _structure(gray)
+        # Away from where the lens saw nothing: the border of that is no corner of the world.
+        mask = cv2.erode(photo.seen.astype(np.uint8), np.ones(_WINDOW, np.uint8))
+        corners = cv2.goodFeaturesToTrack(gray, _MAX_CORNERS, _QUALITY, _DISTANCE, mask=mask, blockSize=_CORNER_BLOCK)
+        self.corners = np.empty((0, 2), np.float32) if corners is None else corners.reshape(-1, 2)
+
+    def track(self, image: np.ndarray) -> Matches:
+        """Find the photo's corners in a render (H, W, 3) uint8 RGB of its size.
+
+        Corners that cannot be followed there and back are left out.
+        """
+        if len(self.corners) == 0:
+            return Matches.none()
+        structure = _structure(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
+        there, found = _flow(self._structure, structure, self.corners)
+        back, found_back = _flow(structure, self._structure, there)
+        kept = found & found_back & (np.linalg.norm(back - self.corners, axis=1) <= _MAX_RETURN_ERROR)
+        pixels = self.corners[kept].astype(np.float64)
+        return Matches(pixels, there[kept].astype(np.float64), np.ones(len(pixels)))
+
+
+def _structure(gray: np.ndarray) -> np.ndarray:
+    structure, _ = local_structure(gray, _NEIGHBOURHOOD, _MIN_CONTRAST)
+    return np.clip(128 + _GAIN * structure, 0, 255).astype(np.uint8)
+
+
+def _flow(here: np.ndarray, there: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where pixels (N, 2) of one image are in another: (N, 2), and which were found (N,) bool."""
+    moved, found, _ = cv2.calcOpticalFlowPyrLK(
+        here, there, pixels, None, winSize=_WINDOW, maxLevel=_LEVELS, criteria=_CRITERIA
+    )
+    return moved, found[:, 0] == 1
