@@ -202,11 +202,16 @@ def accuracy(results: Sequence[QueryResult]) -> dict:
     }
 
 
+def finite_or_none(value: float) -> float | None:
+    """A number as JSON can hold it: None for NaN and infinities."""
+    return float(value) if math.isfinite(value) else None
+
+
 def _evidence(estimate: Estimate) -> dict[str, float | None]:
     """The plain numbers in an estimate, by name, but for those that a QueryResult has itself."""
     numbers = {}
     for field in fields(estimate):
         value = getattr(estimate, field.name)
         if isinstance(value, int | float) and field.name not in ("matches", "inliers", "passes"):
-            numbers[field.name] = float(value) if math.isfinite(value) else None
+            numbers[field.name] = finite_or_none(value)
     return numbers

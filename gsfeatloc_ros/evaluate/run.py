@@ -11,6 +11,7 @@ from pathlib import Path
 import cv2
 
 from gsfeatloc_ros.estimate import Estimate
+from gsfeatloc_ros.evaluate.ablation import MeanDepthRenderer, WholePixelMatcher, without
 from gsfeatloc_ros.evaluate.dataset import Scene
 from gsfeatloc_ros.evaluate.extras import import_extra
 from gsfeatloc_ros.evaluate.metrics import QueryResult, measure
@@ -42,6 +43,7 @@ class Run:
         seed: of the priors and of RANSAC.
         max_width: wider photos are resized to this many pixels.
         options: fields of LocalizerOptions that differ from the default, with their values.
+        without: the one of ablation.PIECES that is taken out, or "".
     """
 
     scene: Path
@@ -54,6 +56,7 @@ class Run:
     seed: int
     max_width: int
     options: tuple[tuple[str, float], ...] = ()
+    without: str = ""
 
     def settings(self) -> dict:
         """The same, ready for JSON."""
@@ -136,10 +139,11 @@ def localize(task: Task, threads: int = 0) -> tuple[QueryResult, Estimate]:
     photo = scene.photos[prior.photo]
     image = scene.read_photo(photo)
     start = time.perf_counter()
-    if isinstance(localizer, Localizer):
-        estimate = localizer.localize(image, photo.camera, prior.T_map_camera, prior.covariance)
-    else:
-        estimate = localizer.localize(image, photo.camera, prior.T_map_camera)
+    with without(run.without):
+        if isinstance(localizer, Localizer):
+            estimate = localizer.localize(image, photo.camera, prior.T_map_camera, prior.covariance)
+        else:
+            estimate = localizer.localize(image, photo.camera, prior.T_map_camera)
     milliseconds = 1000.0 * (time.perf_counter() - start)
     result = measure(
         photo.name,
@@ -178,6 +182,10 @@ def _localizer(run: Run, version: str, threads: int) -> Localizer | PublishedLoc
     scene = open_scene(run.scene, run.map_path, version)
     renderer = open_renderer(scene.map_path, scene.background, version, threads)
     matcher = _matcher(run.matcher, threads)
+    if run.without == "sub-pixel":
+        matcher = WholePixelMatcher(matcher)
+    if run.without == "median-depth":
+        renderer = MeanDepthRenderer(renderer)
     localizer = create_localizer(run.method, renderer, matcher, run.max_width, run.seed, run.options)
     # What is compiled or loaded at the first call does not count.
     localizer.localize(scene.read_photo(scene.photos[0]), scene.camera, scene.photos[0].T_map_camera)

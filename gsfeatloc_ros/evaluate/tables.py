@@ -71,13 +71,16 @@ class Group:
             "sigma": run.sigma,
             "seed": run.seed if len(self.members) == 1 else self.seeds,
             "options": dict(run.options),
+            "without": run.without,
             **self.summary,
         }
 
     @property
     def label(self) -> str:
-        """Method, matcher and changed options, in short."""
-        return " ".join([self.run.method, self.run.matcher, *(f"{name}={value:g}" for name, value in self.run.options)])
+        """Method, matcher, changed options and what was left out, in short."""
+        run = self.run
+        left_out = [f"without {run.without}"] if run.without else []
+        return " ".join([run.method, run.matcher, *(f"{name}={value:g}" for name, value in run.options), *left_out])
 
 
 def over_seeds(runs: Sequence[RunResults]) -> list[Group]:

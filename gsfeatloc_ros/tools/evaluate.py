@@ -23,6 +23,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
+from gsfeatloc_ros.evaluate.ablation import PIECES
 from gsfeatloc_ros.evaluate.metrics import MAX_ROTATION_ERROR_DEG, MAX_TRANSLATION_ERROR, QueryResult
 from gsfeatloc_ros.evaluate.protocol import PROTOCOLS
 from gsfeatloc_ros.evaluate.record import Fingerprint, Record, fingerprint_of, hash_scene
@@ -147,13 +148,15 @@ def _runs(options: argparse.Namespace) -> list[Run]:
             seed=seed,
             max_width=options.max_width,
             options=changed,
+            without="" if without == "nothing" else without,
         )
         for scene, map_path in zip(options.scene, maps, strict=True)
         for matcher, method, protocol, sigma, seed in itertools.product(
             options.matcher, options.method, options.protocol, options.sigma, options.seed
         )
-        # The published recipe has no options.
+        # The published recipe has no options and is taken whole.
         for changed in (itertools.product(*sets) if method == "default" else [()])
+        for without in (options.without if method == "default" else ["nothing"])
     ]
 
 
@@ -239,6 +242,13 @@ def _parser() -> argparse.ArgumentParser:
         action=_Settings,
         metavar="OPTION=LIST",
         help=f"change an option of method default: {', '.join(_localizer_options())}",
+    )
+    parser.add_argument(
+        "--without",
+        type=_names(("nothing", *PIECES)),
+        default=["nothing"],
+        metavar="LIST",
+        help=f"take a piece out of method default, one at a time: nothing, {', '.join(PIECES)} (default: nothing)",
     )
     parser.add_argument("--limit", type=_number(int, 0), default=0, help="only the first photos; 0 for all")
     parser.add_argument(
