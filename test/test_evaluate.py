@@ -9,8 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gsfeatloc_ros import localize
 from gsfeatloc_ros.camera import Camera
 from gsfeatloc_ros.estimate import Estimate, Status
+from gsfeatloc_ros.evaluate.ablation import PIECES, MeanDepthRenderer, without
 from gsfeatloc_ros.evaluate.dataset import Photo, Scene
 from gsfeatloc_ros.evaluate.metrics import (
     QueryResult,
@@ -43,8 +45,10 @@ from gsfeatloc_ros.geometry import (
     so3_log,
     translation_error,
 )
-from gsfeatloc_ros.match import Features, Matches
-from gsfeatloc_ros.render import Render
+from gsfeatloc_ros.localize import Localizer, LocalizerOptions
+from gsfeatloc_ros.match import Features, Matches, create_matcher
+from gsfeatloc_ros.pose import lift, solve
+from gsfeatloc_ros.render import Render, create_renderer
 
 CAMERA = Camera(320, 240, np.array([[300.0, 0, 160], [0, 300.0, 120], [0, 0, 1]]))
 PRIOR = make_pose(so3_exp(np.array([0.3, -1.2, 0.8])), np.array([5.0, -3.0, 2.0]))
@@ -495,3 +499,39 @@ def test_success_by_step():
     assert second["prior_translation_error"] == pytest.approx(0.5)
     assert (second["queries"], second["success_rate"], second["wrong_answers"]) == (1, 0.0, 0)
     assert by_step([]) == []
+
+
+# Ablation
+
+
+def pieces_in_place():
+    return (lift.MIN_ALPHA, lift.MAX_DEPTH_STEP, solve.CAUCHY_SCALE, localize.CornerTracker)
+
+
+@pytest.mark.parametrize("piece", ["", *PIECES])
+def test_a_piece_is_back_afterwards(piece):
+    whole = pieces_in_place()
+    with without(piece, matcher=None):
+        assert (pieces_in_place() == whole) == (piece in ("", "median-depth"))
+    assert pieces_in_place() == whole
+    with pytest.raises(KeyError), without(piece, matcher=None):
+        raise KeyError
+    assert pieces_in_place() == whole
+
+
+@pytest.mark.parametrize("piece", PIECES)
+def test_every_piece_makes_a_difference(piece, room_map, room_camera, room_queries):
+    query, matcher = room_queries[0], create_matcher("sift")
+    renderer = create_renderer(room_map)
+    options = LocalizerOptions(min_inlier_ratio=0.3, max_passes=1)
+
+    def answer(taken_out):
+        used = MeanDepthRenderer(renderer) if taken_out == "median-depth" else renderer
+        with without(taken_out, matcher):
+            return Localizer(used, matcher, options).localize(query.image, room_camera, query.T_map_camera_prior)
+
+    whole, part = answer(""), answer(piece)
+    assert whole.localized
+    assert part.localized, part.reason
+    assert not np.array_equal(whole.T_map_camera, part.T_map_camera)
+    assert translation_error(part.T_map_camera, query.T_map_camera) < 0.05

@@ -9,34 +9,42 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from types import ModuleType
 
 import numpy as np
 
+from gsfeatloc_ros import localize
 from gsfeatloc_ros.camera import Camera
-from gsfeatloc_ros.match.base import Features, Matcher, Matches
+from gsfeatloc_ros.match.base import Matcher, Matches
+from gsfeatloc_ros.match.track import CornerTracker
+from gsfeatloc_ros.photo import Photo
 from gsfeatloc_ros.pose import lift, solve
 from gsfeatloc_ros.render.base import Render, Renderer
 
-PIECES = ("sub-pixel", "median-depth", "depth-gating", "robust-loss")
+PIECES = ("tracking", "sub-pixel", "median-depth", "depth-gating", "robust-loss")
 
 # Values of a module's limits with which it does nothing.
-_LIMITS: dict[str, tuple[ModuleType, dict[str, float]]] = {
+_NO_LIMITS: dict[str, tuple[ModuleType, dict[str, float]]] = {
     "depth-gating": (lift, {"MIN_ALPHA": 0.0, "MAX_DEPTH_STEP": np.inf}),
     "robust-loss": (solve, {"CAUCHY_SCALE": 1e3}),
 }
 
 
 @contextmanager
-def without(piece: str) -> Iterator[None]:
-    """While this is open, lifting and solving do without `piece`, if it is one of theirs."""
-    if piece not in _LIMITS:
-        yield
-        return
-    module, limits = _LIMITS[piece]
-    before = {name: getattr(module, name) for name in limits}
+def without(piece: str, matcher: Matcher) -> Iterator[None]:
+    """While this is open, localizers do without `piece`: one of PIECES, or "" for nothing.
+
+    What takes the place of tracking is the matching of features at full size, by `matcher`.
+    """
+    module, values = _NO_LIMITS.get(piece, (localize, {}))
+    if piece == "tracking":
+        values = {"CornerTracker": partial(FeatureTracker, matcher)}
+    if piece == "sub-pixel":
+        values = {"CornerTracker": WholePixelTracker}
+    before = {name: getattr(module, name) for name in values}
     try:
-        for name, value in limits.items():
+        for name, value in values.items():
             setattr(module, name, value)
         yield
     finally:
@@ -44,20 +52,25 @@ def without(piece: str) -> Iterator[None]:
             setattr(module, name, value)
 
 
-class WholePixelMatcher:
-    """A matcher whose pixels are rounded: without "sub-pixel"."""
+class FeatureTracker:
+    """Has the place of a CornerTracker, and matches features instead."""
 
-    def __init__(self, matcher: Matcher) -> None:
+    def __init__(self, matcher: Matcher, photo: Photo) -> None:
         self._matcher = matcher
+        self.corners = matcher.features(photo.image)
 
-    def features(self, image: np.ndarray) -> Features:
-        """The features of an RGB image (H, W, 3) uint8."""
-        return self._matcher.features(image)
+    def track(self, image: np.ndarray) -> Matches:
+        """Find the photo's features in a render."""
+        return self._matcher.match(self.corners, self._matcher.features(image))
 
-    def match(self, a: Features, b: Features) -> Matches:
-        """Match the features of two images."""
-        matches = self._matcher.match(a, b)
-        return replace(matches, a=np.round(matches.a), b=np.round(matches.b))
+
+class WholePixelTracker(CornerTracker):
+    """Without "sub-pixel": where the corners are in the render is rounded."""
+
+    def track(self, image: np.ndarray) -> Matches:
+        """Find the photo's corners in a render."""
+        matches = super().track(image)
+        return replace(matches, b=np.round(matches.b))
 
 
 class MeanDepthRenderer:

@@ -11,7 +11,7 @@ from pathlib import Path
 import cv2
 
 from gsfeatloc_ros.estimate import Estimate
-from gsfeatloc_ros.evaluate.ablation import MeanDepthRenderer, WholePixelMatcher, without
+from gsfeatloc_ros.evaluate.ablation import MeanDepthRenderer, without
 from gsfeatloc_ros.evaluate.dataset import Scene
 from gsfeatloc_ros.evaluate.extras import import_extra
 from gsfeatloc_ros.evaluate.metrics import QueryResult, measure
@@ -139,7 +139,7 @@ def localize(task: Task, threads: int = 0) -> tuple[QueryResult, Estimate]:
     photo = scene.photos[prior.photo]
     image = scene.read_photo(photo)
     start = time.perf_counter()
-    with without(run.without):
+    with without(run.without, _matcher(run.matcher, threads)):
         if isinstance(localizer, Localizer):
             estimate = localizer.localize(image, photo.camera, prior.T_map_camera, prior.covariance)
         else:
@@ -182,8 +182,6 @@ def _localizer(run: Run, version: str, threads: int) -> Localizer | PublishedLoc
     scene = open_scene(run.scene, run.map_path, version)
     renderer = open_renderer(scene.map_path, scene.background, version, threads)
     matcher = _matcher(run.matcher, threads)
-    if run.without == "sub-pixel":
-        matcher = WholePixelMatcher(matcher)
     if run.without == "median-depth":
         renderer = MeanDepthRenderer(renderer)
     localizer = create_localizer(run.method, renderer, matcher, run.max_width, run.seed, run.options)
