@@ -32,7 +32,7 @@ class Estimate:
             radians, both about the axes of the map frame at the camera centre; None unless LOCALIZED.
         matches: number of the photo's corners that were found in the last render; of matches where no pose was found.
         inliers: number of those that have a depth and agree with the pose.
-        inlier_ratio: their share of those that have a depth; NaN without pose.
+        inlier_ratio: share that agrees, with some allowance for blur, of those that have a depth; NaN without pose.
         coverage: share of the photo's cells, in a grid of 8 x 6, that hold an inlier.
         agreement: correlation of photo and render at the estimate (pose/acceptance.py); NaN where it cannot be said.
         reprojection_error: RMS of the inliers' reprojection errors in pixels of the localized image; NaN without pose.

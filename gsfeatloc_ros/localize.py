@@ -14,7 +14,7 @@ from gsfeatloc_ros.geometry import so3_log
 from gsfeatloc_ros.match.base import Matcher
 from gsfeatloc_ros.match.track import CornerTracker
 from gsfeatloc_ros.photo import Photo
-from gsfeatloc_ros.pose.acceptance import agreement, coverage
+from gsfeatloc_ros.pose.acceptance import agreeing_share, agreement, coverage
 from gsfeatloc_ros.render.base import Renderer
 from gsfeatloc_ros.search import CONFIRMED_HINT, MIN_HINT, SEARCH_WIDTH, STRONG_HINT, look, promising, spread_poses
 from gsfeatloc_ros.timing import StageClock
@@ -30,7 +30,7 @@ class LocalizerOptions:
         max_passes: most renders at estimates to which the photo is tracked.
         max_reprojection_error: pixels, of the resized photo, within which a corner agrees with a pose.
         min_inliers: fewer of the photo's corners that agree on the pose, in the render at the estimate, reject it.
-        min_inlier_ratio: as does a smaller share of inliers among the corners that were found and have a depth,
+        min_inlier_ratio: as does a smaller share that agrees, of the corners that were found and have a depth,
         min_coverage: inliers in a smaller share of the photo's cells (8 x 6),
         min_agreement: or a smaller correlation of the photo with the render at the estimate.
         max_deviation: as does a pose farther from the prior than this many standard deviations of it: a mirror image,
@@ -45,7 +45,7 @@ class LocalizerOptions:
     max_passes: int = 4
     max_reprojection_error: float = 3.0
     min_inliers: int = 20
-    min_inlier_ratio: float = 0.88
+    min_inlier_ratio: float = 0.94
     min_coverage: float = 0.1
     min_agreement: float = 0.3
     max_deviation: float = 8.0
@@ -61,7 +61,7 @@ class LocalizerOptions:
 
 
 # A render nearer to the photo than this many pixels is at the estimate.
-_SETTLED_PIXELS = 1.0
+_SETTLED_PIXELS = 0.5
 # What a prior's covariance is taken to be at least, as a share of that of a prior without one.
 _LEAST_SHARE_OF_USUAL = 0.01
 # Views are searched in batches of this many; the best of each are followed before the next is rendered.
@@ -194,7 +194,7 @@ class Localizer:
         pose = view.solution.T_map_camera
         evidence = replace(
             evidence,
-            inlier_ratio=view.inliers / len(view.points),
+            inlier_ratio=agreeing_share(view.solution.errors, options.max_reprojection_error),
             coverage=coverage(view.correspondences.a, camera.width, camera.height),
             agreement=agreement(query.photo, view.render),
             reprojection_error=view.solution.reprojection_error,

@@ -9,6 +9,9 @@ from gsfeatloc_ros.photo import Photo
 from gsfeatloc_ros.render.base import Render
 from gsfeatloc_ros.structure import local_structure
 
+# Corners may be off by this many times the median error, up to this many times the reprojection error allowed.
+_BLUR_MEDIANS = 4.0
+_BLUR_MOST = 2.0
 # The photo is divided into this many cells across and down.
 _CELLS = (8, 6)
 # Photo and render are compared at this width: finer detail splats do not draw, and a mirror image has the coarser too.
@@ -28,6 +31,15 @@ def coverage(pixels: np.ndarray, width: int, height: int) -> float:
     columns = np.clip((pixels[:, 0] + 0.5) * _CELLS[0] // width, 0, _CELLS[0] - 1).astype(int)
     rows = np.clip((pixels[:, 1] + 0.5) * _CELLS[1] // height, 0, _CELLS[1] - 1).astype(int)
     return len(np.unique(rows * _CELLS[0] + columns)) / (_CELLS[0] * _CELLS[1])
+
+
+def agreeing_share(errors: np.ndarray, max_error: float) -> float:
+    """Share of the tracked corners that agree with a pose, by their reprojection errors (M,) in pixels, M > 0.
+
+    In a blurred photo all of them are less certain: they may be off by four times the median, up to twice `max_error`.
+    """
+    tolerance = np.clip(_BLUR_MEDIANS * np.median(errors), max_error, _BLUR_MOST * max_error)
+    return float(np.mean(errors <= tolerance))
 
 
 def agreement(photo: Photo, render: Render) -> float:

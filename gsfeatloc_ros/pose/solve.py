@@ -35,12 +35,14 @@ class PoseSolution:
     Attributes:
         T_map_camera: (4, 4) float64.
         covariance: (6, 6) float64, ROS order (x y z, rotation about x y z), axes of the map frame.
+        errors: (M,) reprojection errors of the matches in pixels.
         inliers: (M,) bool, matches within the threshold.
         reprojection_error: RMS over the inliers, pixels.
     """
 
     T_map_camera: np.ndarray
     covariance: np.ndarray
+    errors: np.ndarray
     inliers: np.ndarray
     reprojection_error: float
 
@@ -72,7 +74,7 @@ def solve_pose(
     inliers = errors <= max_error
     if inliers.sum() < MIN_POINTS:
         return None
-    return PoseSolution(T_map_camera, covariance, inliers, float(np.sqrt(np.mean(errors[inliers] ** 2))))
+    return PoseSolution(T_map_camera, covariance, errors, inliers, float(np.sqrt(np.mean(errors[inliers] ** 2))))
 
 
 def ransac_pose(
