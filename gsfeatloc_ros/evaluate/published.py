@@ -14,6 +14,7 @@ from gsfeatloc_ros.render.base import Renderer
 _MIN_MATCHES = 4
 _MAX_REPROJECTION_ERROR = 5.0  # pixels
 _ITERATIONS = 50
+_FARTHEST = 1e6  # map units
 
 
 class PublishedLocalizer:
@@ -54,9 +55,10 @@ class PublishedLocalizer:
             reprojectionError=_MAX_REPROJECTION_ERROR,
             flags=cv2.SOLVEPNP_EPNP,
         )
-        if not solved:
+        T_camera_map = make_pose(cv2.Rodrigues(rotation_vector)[0], translation.ravel()) if solved else None
+        # EPnP of degenerate points gives NaN, or a camera at infinity.
+        if T_camera_map is None or not np.abs(T_camera_map).max() < _FARTHEST:
             return Estimate(Status.FAILED, "RANSAC found no pose", matches=len(matches))
-        T_camera_map = make_pose(cv2.Rodrigues(rotation_vector)[0], translation.ravel())
         return Estimate(
             Status.LOCALIZED,
             "RANSAC found a pose",
