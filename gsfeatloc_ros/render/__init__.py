@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from gsfeatloc_ros.maps.gaussian_map import GaussianMap
 from gsfeatloc_ros.render.base import Render, Renderer
+
+if TYPE_CHECKING:
+    from gsfeatloc_ros.render.prepare import PreparedMap
 
 __all__ = ["DEVICES", "Render", "Renderer", "create_renderer"]
 
@@ -11,25 +16,29 @@ DEVICES = ("auto", "cpu")
 
 
 def create_renderer(
-    gaussian_map: GaussianMap,
+    gaussian_map: GaussianMap | PreparedMap,
     device: str = "auto",
     threads: int = 0,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    sh_degree: int = 3,
+    resolution_scale: float = 1.0,
 ) -> Renderer:
     """Make the renderer of a map.
 
     Args:
-        gaussian_map: the map to draw.
+        gaussian_map: the map to draw, as it was read or prepared (render/prepare.py). It need not be kept.
         device: "cpu", or "auto" for the best that this machine has (at present the CPU).
         threads: CPU threads to use; 0 for one per core.
         background: RGB in [0, 1] behind the map.
+        sh_degree: degree of the spherical harmonics that are drawn, 0 to 3; those of the map beyond are left out.
+        resolution_scale: draw pictures of so many times the width and height, 0.1 to 1, and enlarge them.
 
     Raises:
-        ValueError: an unknown device.
+        ValueError: an unknown device, or a number out of its range.
     """
     if device not in DEVICES:
         raise ValueError(f"renderer device {device!r} is not one of {', '.join(DEVICES)}")
     # Imported here: numba takes a second, and users of the protocol alone do not need it.
     from gsfeatloc_ros.render.cpu import CpuRenderer
 
-    return CpuRenderer(gaussian_map, threads, background)
+    return CpuRenderer(gaussian_map, threads, background, sh_degree, resolution_scale)

@@ -1,0 +1,163 @@
+"""Prepared maps kept in files beside the maps: reading one takes a fraction of the time of preparing it again."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import hashlib
+import json
+import logging
+import math
+import os
+import zlib
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+
+import gsfeatloc_ros
+from gsfeatloc_ros.maps import Similarity, load_map
+from gsfeatloc_ros.render.prepare import PreparedMap, prepare
+
+SUFFIX = ".gsfeatloc-cache"
+
+_log = logging.getLogger(__name__)
+
+# A cache is this line, the CRC-32 of all that follows the next number (4 bytes), the length of the header (4 bytes,
+# both little-endian), the header (JSON) and the arrays one after another.
+_MAGIC = b"gsfeatloc_ros prepared map\n"
+_MAX_HEADER_BYTES = 64 * 1024
+# Of a map's content so many blocks are hashed, spread evenly. Size and time alone may be those of another map: images
+# of containers and archives set all times to the same. To hash it all takes reading it all, which the cache is to save.
+_SAMPLES, _SAMPLE_BYTES = 64, 4096
+# An unbundled .sog is the files of these kinds in its folder.
+_SOG_SUFFIXES = (".json", ".webp")
+
+
+class _CacheError(Exception):
+    """A file is no cache, or a damaged one."""
+
+
+def load_prepared(
+    path: str | Path, alignment: Similarity | None = None, cache_path: str | Path | None = None
+) -> PreparedMap:
+    """Read a map prepared from its cache; where there is none for it, load and prepare it, and write the cache.
+
+    Args:
+        path: the map, as for load_map.
+        alignment: the map's S_map_splat; it is no part of the cache.
+        cache_path: file of the cache; None for the map's name and SUFFIX, in the same folder. That it cannot be
+            written is no error.
+
+    Raises:
+        MapError: the map cannot be used.
+    """
+    path = Path(path)
+    absolute = Path(os.path.abspath(path))
+    cache_path = absolute.with_name(absolute.name + SUFFIX) if cache_path is None else Path(cache_path)
+    origin = _origin(absolute)
+    prepared = _read_if_usable(cache_path, origin)
+    if prepared is None:
+        prepared = prepare(load_map(path))
+        _write_if_possible(cache_path, prepared, origin)
+    return prepared if alignment is None else replace(prepared, S_map_splat=alignment)
+
+
+def _read_if_usable(path: Path, origin: dict[str, Any]) -> PreparedMap | None:
+    """The map in a cache; None where there is no cache of a map of this `origin`."""
+    try:
+        with path.open("rb") as stream:
+            return _read(stream, origin)
+    except FileNotFoundError:
+        return None
+    except (OSError, _CacheError) as error:
+        _log.warning("%s: %s: ignored, the map is prepared again", path, error)
+        return None
+
+
+def _read(stream: BinaryIO, origin: dict[str, Any]) -> PreparedMap | None:
+    if stream.read(len(_MAGIC)) != _MAGIC:
+        raise _CacheError("is no prepared map")
+    checksum, length = (int.from_bytes(stream.read(4), "little") for _ in range(2))
+    if length > _MAX_HEADER_BYTES:
+        raise _CacheError("is damaged")
+    encoded = stream.read(length)
+    try:
+        header = json.loads(encoded)
+        if header["origin"] != origin:
+            return None
+        layout = {name: (np.dtype(dtype), shape) for name, (dtype, shape) in header["arrays"].items()}
+        size = sum(dtype.itemsize * math.prod(shape) for dtype, shape in layout.values())
+        if size != os.fstat(stream.fileno()).st_size - stream.tell():
+            raise _CacheError("is truncated")
+        arrays = {
+            name: np.fromfile(stream, dtype, math.prod(shape)).reshape(shape) for name, (dtype, shape) in layout.items()
+        }
+        if _checksum(encoded, arrays) != checksum:
+            raise _CacheError("is damaged")
+        return PreparedMap(**arrays, antialiased=header["antialiased"])
+    except (KeyError, TypeError, AttributeError, ValueError, RecursionError) as error:
+        raise _CacheError("is damaged") from error
+
+
+def _write_if_possible(path: Path, prepared: PreparedMap, origin: dict[str, Any]) -> None:
+    """Write a cache in one step: whoever reads it finds the old one or the whole new one, after a power cut as well."""
+    temporary = path.with_name(f"{path.name}.{os.getpid()}")
+    try:
+        with temporary.open("wb") as stream:
+            _write(stream, prepared, origin)
+            stream.flush()
+            os.fsync(stream.fileno())
+        os.replace(temporary, path)
+    except OSError as error:
+        _log.debug("%s: cannot be written: %s", path, error.strerror)
+        with contextlib.suppress(OSError):
+            temporary.unlink()
+
+
+def _write(stream: BinaryIO, prepared: PreparedMap, origin: dict[str, Any]) -> None:
+    values = {field.name: getattr(prepared, field.name) for field in fields(prepared)}
+    arrays = {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
+    layout = {name: (array.dtype.str, array.shape) for name, array in arrays.items()}
+    encoded = json.dumps({"origin": origin, "antialiased": prepared.antialiased, "arrays": layout}).encode()
+    stream.write(_MAGIC)
+    for number in (_checksum(encoded, arrays), len(encoded)):
+        stream.write(number.to_bytes(4, "little"))
+    stream.write(encoded)
+    for array in arrays.values():
+        array.tofile(stream)
+
+
+def _checksum(header: bytes, arrays: dict[str, np.ndarray]) -> int:
+    return functools.reduce(lambda checksum, part: zlib.crc32(part, checksum), arrays.values(), zlib.crc32(header))
+
+
+def _origin(path: Path) -> dict[str, Any]:
+    """What a cache is made from: the code that reads and prepares maps, and the files of the map."""
+    folder = path if path.is_dir() else path.parent if path.suffix == ".json" else None
+    files = [path] if folder is None else sorted(file for file in folder.iterdir() if file.suffix in _SOG_SUFFIXES)
+    return {"code": _code(), "files": [_identity(file) for file in files if file.is_file()]}
+
+
+def _identity(file: Path) -> list[Any]:
+    """Name, size in bytes, time of the last change and a hash of a sample of the content."""
+    status = file.stat()
+    last = max(status.st_size - _SAMPLE_BYTES, 0)
+    digest = hashlib.sha256()
+    with file.open("rb") as stream:
+        for sample in range(_SAMPLES):
+            stream.seek(last * sample // (_SAMPLES - 1))
+            digest.update(stream.read(_SAMPLE_BYTES))
+    return [file.name, status.st_size, status.st_mtime_ns, digest.hexdigest()]
+
+
+@functools.cache
+def _code() -> str:
+    """Hash of the sources that decide what a prepared map is: the version of the cache."""
+    package = Path(gsfeatloc_ros.__file__).parent
+    digest = hashlib.sha256()
+    preparing = (package / "render" / name for name in ("base.py", "lanes.py", "prepare.py"))
+    for source in [*sorted(package.glob("maps/*.py")), *preparing]:
+        digest.update(source.read_bytes())
+    return digest.hexdigest()

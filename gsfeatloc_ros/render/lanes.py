@@ -1,0 +1,301 @@
+"""Sixteen float32 numbers side by side, as a type that numba kernels calculate with.
+
+`Lanes` is LLVM's <16 x float>: one AVX-512 register, two of AVX2 or four of NEON, from one source. Arithmetic and
+comparisons take `Lanes` or numbers on either side; a comparison gives a mask for `select`.
+"""
+
+from __future__ import annotations
+
+import operator
+
+import numpy as np
+from llvmlite import ir
+from numba import njit, types
+from numba.core import cgutils
+from numba.core.typing import signature
+from numba.core.typing.templates import AbstractTemplate, infer_global
+from numba.extending import intrinsic, lower_builtin, models, register_model
+
+LANES = 16
+
+_FLOATS = ir.VectorType(ir.FloatType(), LANES)
+_SHORTS = ir.VectorType(ir.IntType(16), LANES)
+_INTS = ir.VectorType(ir.IntType(32), LANES)
+_BITS = ir.VectorType(ir.IntType(1), LANES)
+# Where a float16's sign, exponent and fraction are in a float32; the exponents count from different numbers.
+_HALF_BITS = 0x8FFFE000
+_HALF_SCALE = 2.0**112
+# Not "fast": NaN and infinity keep their meaning, and roundings are not optimised away.
+_FLAGS = ("contract", "nsz", "arcp")
+
+
+class _LanesType(types.Type):
+    def __init__(self) -> None:
+        super().__init__("Lanes")
+
+
+class _MaskType(types.Type):
+    def __init__(self) -> None:
+        super().__init__("Mask")
+
+
+_LANES, _MASK = _LanesType(), _MaskType()
+
+
+@register_model(_LanesType)
+class _LanesModel(models.PrimitiveModel):
+    def __init__(self, manager, fe_type) -> None:
+        super().__init__(manager, fe_type, _FLOATS)
+
+
+@register_model(_MaskType)
+class _MaskModel(models.PrimitiveModel):
+    def __init__(self, manager, fe_type) -> None:
+        super().__init__(manager, fe_type, _BITS)
+
+
+def _spread(builder, number):
+    """A vector with the same number in every lane."""
+    first = builder.insert_element(ir.Constant(_FLOATS, ir.Undefined), number, ir.Constant(ir.IntType(32), 0))
+    return builder.shuffle_vector(first, ir.Constant(_FLOATS, ir.Undefined), ir.Constant(_INTS, [0] * LANES))
+
+
+def _define_operator(function, result, emit) -> None:
+    """Let `function` of two Lanes, or of one and a number, give a `result` by what `emit(builder, a, b)` writes."""
+
+    @infer_global(function)
+    class _Operator(AbstractTemplate):
+        def generic(self, args, kws):
+            if len(args) == 2 and _LANES in args and all(a is _LANES or isinstance(a, types.Number) for a in args):
+                return signature(result, *(a if a is _LANES else types.float32 for a in args))
+            return None
+
+    def lower(context, builder, sig, args):
+        vectors = (v if t is _LANES else _spread(builder, v) for v, t in zip(args, sig.args, strict=True))
+        return emit(builder, *vectors)
+
+    for operands in ((_LANES, _LANES), (_LANES, types.float32), (types.float32, _LANES)):
+        lower_builtin(function, *operands)(lower)
+
+
+_define_operator(operator.add, _LANES, lambda builder, a, b: builder.fadd(a, b, flags=_FLAGS))
+_define_operator(operator.sub, _LANES, lambda builder, a, b: builder.fsub(a, b, flags=_FLAGS))
+_define_operator(operator.mul, _LANES, lambda builder, a, b: builder.fmul(a, b, flags=_FLAGS))
+_define_operator(operator.truediv, _LANES, lambda builder, a, b: builder.fdiv(a, b, flags=_FLAGS))
+_define_operator(operator.lt, _MASK, lambda builder, a, b: builder.fcmp_ordered("<", a, b))
+_define_operator(operator.le, _MASK, lambda builder, a, b: builder.fcmp_ordered("<=", a, b))
+_define_operator(operator.gt, _MASK, lambda builder, a, b: builder.fcmp_ordered(">", a, b))
+_define_operator(operator.ge, _MASK, lambda builder, a, b: builder.fcmp_ordered(">=", a, b))
+
+
+@infer_global(operator.and_)
+class _And(AbstractTemplate):
+    def generic(self, args, kws):
+        return signature(_MASK, *args) if args == (_MASK, _MASK) else None
+
+
+@lower_builtin(operator.and_, _MASK, _MASK)
+def _lower_and(context, builder, sig, args):
+    return builder.and_(*args)
+
+
+@intrinsic
+def spread(typingctx, number):
+    """The same number in every lane."""
+
+    def codegen(context, builder, sig, args):
+        return _spread(builder, args[0])
+
+    return _LANES(types.float32), codegen
+
+
+def _pointer(context, builder, array_type, array, index, vector):
+    data = context.make_array(array_type)(context, builder, array).data
+    return builder.bitcast(builder.gep(data, [index]), vector.as_pointer())
+
+
+@intrinsic
+def load(typingctx, array, index):
+    """array[index : index + LANES] of a flat, contiguous float32 array; neither end is checked."""
+
+    def codegen(context, builder, sig, args):
+        return builder.load(_pointer(context, builder, sig.args[0], *args, _FLOATS), align=4)
+
+    return _LANES(array, types.intp), codegen
+
+
+@intrinsic
+def prefetch(typingctx, array, index):
+    """Have array[index] brought into the CPU's cache meanwhile."""
+
+    def codegen(context, builder, sig, args):
+        data = context.make_array(sig.args[0])(context, builder, args[0]).data
+        pointer = builder.gep(data, [args[1]])
+        integer = ir.IntType(32)
+        function_type = ir.FunctionType(ir.VoidType(), [pointer.type, integer, integer, integer])
+        function = cgutils.get_or_insert_function(builder.module, function_type, "llvm.prefetch.p0")
+        # For reading, to be kept in all levels of the cache, data.
+        builder.call(function, [pointer, *(ir.Constant(integer, value) for value in (0, 3, 1))])
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp), codegen
+
+
+@intrinsic
+def load_halves(typingctx, array, index):
+    """The same of a float16 array of finite numbers, given as the int16 view of it that numba knows.
+
+    Its bits moved to where a float32 has them, and multiplied: not all CPUs have an instruction for it.
+    """
+
+    def codegen(context, builder, sig, args):
+        halves = builder.load(_pointer(context, builder, sig.args[0], *args, _SHORTS), align=2)
+        moved = builder.shl(builder.sext(halves, _INTS), ir.Constant(_INTS, [13] * LANES))
+        bits = builder.and_(moved, ir.Constant(_INTS, [_HALF_BITS] * LANES))
+        return builder.fmul(builder.bitcast(bits, _FLOATS), ir.Constant(_FLOATS, [_HALF_SCALE] * LANES), flags=_FLAGS)
+
+    return _LANES(array, types.intp), codegen
+
+
+@intrinsic
+def store(typingctx, array, index, values):
+    """array[index : index + LANES] = values, of a flat, contiguous float32 array; neither end is checked."""
+
+    def codegen(context, builder, sig, args):
+        pointer = _pointer(context, builder, sig.args[0], args[0], args[1], _FLOATS)
+        builder.store(args[2], pointer, align=4)
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, _LANES), codegen
+
+
+@intrinsic
+def store_columns(typingctx, array, index, mask, rows):
+    """Store columns of a square matrix, those in the mask, one behind another from array[index] on.
+
+    Of `array`, flat, contiguous and float32, LANES * LANES elements from there on may be overwritten.
+
+    Args:
+        rows: tuple of LANES Lanes, the matrix.
+
+    Returns:
+        the index after the last.
+    """
+
+    def codegen(context, builder, sig, args):
+        array_type, _, _, _ = sig.args
+        array, at, mask, rows = args
+        for lane, column in enumerate(_transposed(builder, [builder.extract_value(rows, i) for i in range(LANES)])):
+            # Each goes to where the next one then overwrites it unless it is in the mask.
+            builder.store(column, _pointer(context, builder, array_type, array, at, _FLOATS), align=4)
+            step = builder.zext(builder.extract_element(mask, ir.Constant(ir.IntType(32), lane)), at.type)
+            at = builder.add(at, builder.mul(step, ir.Constant(at.type, LANES)))
+        return at
+
+    return types.intp(array, types.intp, _MASK, types.UniTuple(_LANES, LANES)), codegen
+
+
+def _transposed(builder, rows: list) -> list:
+    """The columns of a square matrix: blocks off its diagonal change places, of half the size each time."""
+    for size in (8, 4, 2, 1):
+        from_a = [lane if not lane & size else LANES + lane - size for lane in range(LANES)]
+        from_b = [lane + size if not lane & size else LANES + lane for lane in range(LANES)]
+        for i in (i for i in range(LANES) if not i & size):
+            a, b = rows[i], rows[i + size]
+            rows[i] = builder.shuffle_vector(a, b, ir.Constant(_INTS, from_a))
+            rows[i + size] = builder.shuffle_vector(a, b, ir.Constant(_INTS, from_b))
+    return rows
+
+
+@intrinsic
+def select(typingctx, mask, a, b):
+    """`a` in the lanes of the mask, `b` in the others; either may be a number."""
+
+    def codegen(context, builder, sig, args):
+        a, b = (v if t is _LANES else _spread(builder, v) for v, t in zip(args[1:], sig.args[1:], strict=True))
+        return builder.select(args[0], a, b)
+
+    return _LANES(_MASK, *(t if t is _LANES else types.float32 for t in (a, b))), codegen
+
+
+@intrinsic
+def mask_bits(typingctx, mask):
+    """The mask as a number, of which bit i is lane i."""
+
+    def codegen(context, builder, sig, args):
+        return builder.zext(builder.bitcast(args[0], ir.IntType(LANES)), ir.IntType(32))
+
+    return types.uint32(_MASK), codegen
+
+
+@intrinsic
+def lowest_bit(typingctx, bits):
+    """Position of the lowest bit that is set; some is."""
+
+    def codegen(context, builder, sig, args):
+        return builder.cttz(args[0], ir.Constant(ir.IntType(1), 1))
+
+    return bits(bits), codegen
+
+
+@intrinsic
+def bits_of_float(typingctx, value):
+    """Reinterpret a float32 as a uint32."""
+
+    def codegen(context, builder, sig, args):
+        return builder.bitcast(args[0], ir.IntType(32))
+
+    return types.uint32(types.float32), codegen
+
+
+def _unary(name: str):
+    """One of LLVM's functions of a float, lane by lane."""
+
+    def typer(typingctx, values):
+        def codegen(context, builder, sig, args):
+            function_type = ir.FunctionType(_FLOATS, [_FLOATS])
+            function = cgutils.get_or_insert_function(builder.module, function_type, f"{name}.v{LANES}f32")
+            return builder.call(function, args)
+
+        return _LANES(_LANES), codegen
+
+    return intrinsic(typer)
+
+
+sqrt, floor, log2 = _unary("llvm.sqrt"), _unary("llvm.floor"), _unary("llvm.log2")
+
+
+@njit
+def minimum(a, b):
+    """The smaller in each lane; b where either is NaN."""
+    return select(a < b, a, b)
+
+
+@njit
+def maximum(a, b):
+    """The larger in each lane; b where either is NaN."""
+    return select(a > b, a, b)
+
+
+@intrinsic
+def _times_power_of_two(typingctx, values, exponents):
+    """values 2^exponents, of values in [1, 2) and whole exponents in [-126, 127]."""
+
+    def codegen(context, builder, sig, args):
+        shift = builder.shl(builder.fptosi(args[1], _INTS), ir.Constant(_INTS, [23] * LANES))
+        return builder.bitcast(builder.add(builder.bitcast(args[0], _INTS), shift), _FLOATS)
+
+    return _LANES(_LANES, _LANES), codegen
+
+
+# 2^f on [0, 1): minimax polynomial of degree 4, relative error 2.6e-6.
+_P0, _P1, _P2 = (np.float32(1.00000259), np.float32(6.93003835e-1), np.float32(2.41442756e-1))
+_P3, _P4 = np.float32(5.20114611e-2), np.float32(1.3534168e-2)
+
+
+@njit
+def exp2(x):
+    """2^x to a relative 3e-6, for x from -126 to below 128; anything for others."""
+    whole = floor(x)
+    f = x - whole
+    return _times_power_of_two(_P0 + f * (_P1 + f * (_P2 + f * (_P3 + f * _P4))), whole)

@@ -1,0 +1,179 @@
+"""What the CPU renderer makes of a map once, when it is loaded: Gaussians in the order and form that frames need."""
+
+from __future__ import annotations
+
+import math
+import threading
+from dataclasses import dataclass, field
+
+import numpy as np
+from numba import njit, prange
+
+from gsfeatloc_ros.maps.gaussian_map import GaussianMap
+from gsfeatloc_ros.maps.similarity import Similarity
+from gsfeatloc_ros.render.base import MIN_ALPHA
+from gsfeatloc_ros.render.lanes import bits_of_float
+
+# Held while kernels run in parallel: numba's fallback threading layer does not take calls from two threads at once.
+KERNEL_LOCK = threading.Lock()
+
+CHUNK = 256
+# Rows of a chunk: centre, covariance in the splat frame, log2 of the opacity.
+X, Y, Z, XX, XY, XZ, YY, YZ, ZZ, LOG_OPACITY = range(10)
+ROWS = 10
+
+_MIN_HALF, _MAX_HALF = np.float32(2.0**-14), np.float32(65504)
+_MORTON_BITS = 20
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedMap:
+    """The Gaussians of a map that can be seen, sorted by size and along a Morton curve, cut into chunks of CHUNK.
+
+    A chunk keeps its Gaussians side by side, so that one instruction treats many of them. The last chunk is filled up
+    with Gaussians of opacity 0.
+
+    Attributes:
+        gaussians: (chunks, ROWS, CHUNK) float32, splat frame.
+        sh: (chunks, 3 C, CHUNK) float16, row 3 k + channel is harmonic k; half precision costs less than the rounding
+            to 8-bit colours by far, and halves what a map takes.
+        low, high: (chunks, 3) float32, splat frame, the box outside which no Gaussian of the chunk has an alpha of
+            MIN_ALPHA.
+        antialiased, S_map_splat: as in GaussianMap.
+    """
+
+    gaussians: np.ndarray
+    sh: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    antialiased: bool = False
+    S_map_splat: Similarity = field(default_factory=Similarity)
+
+
+def prepare(gaussian_map: GaussianMap) -> PreparedMap:
+    """Prepare a map for CpuRenderer. The result shares no memory with the map."""
+    means, scales, rotations, opacities, sh = (
+        np.ascontiguousarray(values, dtype=np.float32)
+        for values in (
+            gaussian_map.means,
+            gaussian_map.scales,
+            gaussian_map.rotations,
+            gaussian_map.opacities,
+            gaussian_map.sh,
+        )
+    )
+    with KERNEL_LOCK:
+        order = _drawing_order(means, scales, opacities)
+    chunks = -(-len(order) // CHUNK)
+    prepared = PreparedMap(
+        gaussians=np.empty((chunks, ROWS, CHUNK), dtype=np.float32),
+        sh=np.empty((chunks, 3 * sh.shape[1], CHUNK), dtype=np.float16),
+        low=np.empty((chunks, 3), dtype=np.float32),
+        high=np.empty((chunks, 3), dtype=np.float32),
+        antialiased=gaussian_map.antialiased,
+        S_map_splat=gaussian_map.S_map_splat,
+    )
+    with KERNEL_LOCK:
+        _fill_chunks(
+            order,
+            means,
+            scales,
+            rotations,
+            opacities,
+            sh.reshape(len(sh), 3 * sh.shape[1]),
+            prepared.gaussians,
+            prepared.sh.view(np.int16),
+            prepared.low,
+            prepared.high,
+        )
+    return prepared
+
+
+def _drawing_order(means: np.ndarray, scales: np.ndarray, opacities: np.ndarray) -> np.ndarray:
+    """Indices of the Gaussians that can be seen, neighbours in space beside each other, small ones first."""
+    seen = np.flatnonzero(opacities >= MIN_ALPHA)
+    if len(seen) == 0:
+        return seen
+    # Floaters far from everything share the cells at the border, lest all else shares one.
+    sample = means[seen[:: 1 + len(seen) // 100_000]]
+    low, high = np.percentile(sample, [1, 99], axis=0)
+    low, high = low - (high - low), high + (high - low)
+    cell = max(np.max(high - low), np.finfo(np.float32).tiny) / 2**_MORTON_BITS
+    codes = _morton_codes(seen, means, low, cell)
+    # Gaussians of like size share chunks: one large one would make a box large for all.
+    sizes = scales[seen].max(axis=1)
+    octaves = np.log2(sizes / np.median(sizes)).clip(0, 7).astype(np.uint64)
+    codes |= octaves << np.uint64(3 * _MORTON_BITS)
+    return seen[np.argsort(codes, kind="stable")]
+
+
+@njit(parallel=True, nogil=True, cache=True)
+def _morton_codes(seen, means, low, cell):
+    """Morton codes (N,) uint64 of the Gaussians `seen` on a grid of cubes of `cell` from `low` (3,)."""
+    codes = np.empty(len(seen), dtype=np.uint64)
+    for i in prange(len(seen)):
+        code = np.uint64(0)
+        for axis in range(3):
+            place = (means[seen[i], axis] - low[axis]) / cell
+            bits = np.uint64(min(max(place, 0.0), 2.0**_MORTON_BITS - 1))
+            # Two zeros between each bit and the next.
+            bits = (bits | bits << np.uint64(32)) & np.uint64(0x1F00000000FFFF)
+            bits = (bits | bits << np.uint64(16)) & np.uint64(0x1F0000FF0000FF)
+            bits = (bits | bits << np.uint64(8)) & np.uint64(0x100F00F00F00F00F)
+            bits = (bits | bits << np.uint64(4)) & np.uint64(0x10C30C30C30C30C3)
+            bits = (bits | bits << np.uint64(2)) & np.uint64(0x1249249249249249)
+            code |= bits << np.uint64(axis)
+        codes[i] = code
+    return codes
+
+
+@njit
+def _half_bits(value):
+    """The bits, as an int16, of a float32 rounded to half precision; 0 for what is below its normal numbers.
+
+    With whole numbers, as in lanes.load_halves: not all CPUs have an instruction for it.
+    """
+    if abs(value) < _MIN_HALF:
+        return np.int16(0)
+    bits = bits_of_float(np.float32(min(max(value, -_MAX_HALF), _MAX_HALF)))
+    magnitude = ((bits & np.uint32(0x7FFFFFFF)) + np.uint32(0x1000)) >> np.uint32(13)
+    return np.int16((bits >> np.uint32(16) & np.uint32(0x8000)) | (magnitude - np.uint32(112 << 10)))
+
+
+@njit(parallel=True, nogil=True, cache=True)
+def _fill_chunks(order, means, scales, rotations, opacities, sh, gaussians, sh_bits, low, high):
+    for chunk in prange(len(gaussians)):
+        low[chunk], high[chunk] = np.inf, -np.inf
+        rows = gaussians[chunk]
+        for slot in range(CHUNK):
+            place = chunk * CHUNK + slot
+            if place >= len(order):
+                rows[:, slot] = 0
+                rows[LOG_OPACITY, slot] = -np.inf
+                sh_bits[chunk, :, slot] = 0
+                continue
+            i = order[place]
+            w, x, y, z = rotations[i]
+            a, b, c = scales[i]
+            # The axes R diag(scale); the covariance is their product with their transpose.
+            xa, xb, xc = (a * (1 - 2 * (y * y + z * z)), b * 2 * (x * y - w * z), c * 2 * (x * z + w * y))
+            ya, yb, yc = (a * 2 * (x * y + w * z), b * (1 - 2 * (x * x + z * z)), c * 2 * (y * z - w * x))
+            za, zb, zc = (a * 2 * (x * z - w * y), b * 2 * (y * z + w * x), c * (1 - 2 * (x * x + y * y)))
+            rows[X, slot], rows[Y, slot], rows[Z, slot] = means[i]
+            rows[XX, slot] = xa * xa + xb * xb + xc * xc
+            rows[XY, slot] = xa * ya + xb * yb + xc * yc
+            rows[XZ, slot] = xa * za + xb * zb + xc * zc
+            rows[YY, slot] = ya * ya + yb * yb + yc * yc
+            rows[YZ, slot] = ya * za + yb * zb + yc * zc
+            rows[ZZ, slot] = za * za + zb * zb + zc * zc
+            rows[LOG_OPACITY, slot] = math.log2(opacities[i])
+            for k in range(sh.shape[1]):
+                sh_bits[chunk, k, slot] = _half_bits(sh[i, k])
+            # How many standard deviations from the centre alpha falls to MIN_ALPHA.
+            deviations = math.sqrt(max(2 * math.log(opacities[i] / MIN_ALPHA), 0.0))
+            for axis, variance in enumerate((rows[XX, slot], rows[YY, slot], rows[ZZ, slot])):
+                mean = means[i, axis]
+                # A little more, for the rounding to float32.
+                reach = 1.00001 * deviations * math.sqrt(variance) + 1e-6 * abs(mean)
+                low[chunk, axis] = min(low[chunk, axis], np.float32(mean - reach))
+                high[chunk, axis] = max(high[chunk, axis], np.float32(mean + reach))

@@ -1,0 +1,268 @@
+"""Kernel 1 of a frame: project the Gaussians, colour them, and list the tiles that each touches."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit, prange
+
+from gsfeatloc_ros.render import base, prepare
+from gsfeatloc_ros.render.lanes import (
+    LANES,
+    bits_of_float,
+    floor,
+    load,
+    load_halves,
+    log2,
+    mask_bits,
+    maximum,
+    minimum,
+    spread,
+    sqrt,
+    store_columns,
+)
+from gsfeatloc_ros.render.prepare import CHUNK
+
+TILE = 16
+# Fields of a projected splat. The conic is scaled by -log2(e)/2 and opacity is a log2, so that
+# alpha = 2^(LOG_OPACITY + CONIC_XX dx^2 + CONIC_XY dx dy + CONIC_YY dy^2); the box holds the pixels with an alpha of
+# MIN_ALPHA, and is whole numbers.
+(X, Y, CONIC_XX, CONIC_XY, CONIC_YY, LOG_OPACITY, RED, GREEN, BLUE, DEPTH, LEFT, RIGHT, TOP, BOTTOM) = range(14)
+# One line of the CPU's cache.
+SPLAT_SIZE = 16
+
+_F = np.float32
+_ZERO, _ONE, _INFINITY = _F(0), _F(1), _F(np.inf)
+_EPS2D, _NEAR = _F(base.EPS2D), _F(base.NEAR_PLANE)
+_LOG_MIN_ALPHA = _F(math.log2(base.MIN_ALPHA))
+# From -0.5 d^T conic d, and from 2 ln(255 opacity), to base 2.
+_CONIC_SCALE = _F(-0.5 * math.log2(math.e))
+_REACH_SCALE = _F(2.0 * math.log(2.0))
+# Spherical harmonics' constants, as in render/reference.py.
+_SH0, _SH1 = _F(0.28209479177387814), _F(0.4886025119029199)
+_SH2A, _SH2B, _SH2C = (_F(1.0925484305920792), _F(0.31539156525252005), _F(0.5462742152960396))
+_SH3A, _SH3B, _SH3C = (_F(0.5900435899266435), _F(2.890611442640554), _F(0.4570457994644658))
+_SH3D, _SH3E = _F(0.3731763325901154), _F(1.445305721320277)
+
+
+@njit(parallel=True, nogil=True, cache=True)
+def project(chunks, gaussians, sh, harmonics, antialiased, view, splats, pair_tiles, pair_keys, histogram):
+    """Project the Gaussians of `chunks` and list the tiles that each touches.
+
+    Each thread takes a run of chunks and writes its own segment of the pair lists and its own row of the histogram, in
+    map order. A segment too small is left incomplete.
+
+    Args:
+        chunks: (n,) int64 from `visible_chunks`.
+        gaussians: PreparedMap.gaussians, flat.
+        sh: PreparedMap.sh, flat, as int16.
+        harmonics: (stored, used) harmonics per channel.
+        antialiased: dim each Gaussian as much as the blur widens it (Yu et al., "Mip-Splatting", 2024, eq. 9).
+        view: the camera.
+        splats: flat float32, n CHUNK records of SPLAT_SIZE, written for the visible Gaussians.
+        pair_tiles: (threads, capacity) int32, written.
+        pair_keys: (threads, capacity) uint64, written: depth's bits, then the splat's index. Positive floats sort as
+            their bits do.
+        histogram: (threads, tiles) int64, written: pairs of each tile.
+
+    Returns:
+        (threads,) int64: pairs that each thread has, to be compared with the capacity.
+    """
+    threads = len(pair_tiles)
+    tiles_x = -(-view.width // TILE)
+    needed = np.zeros(threads, dtype=np.int64)
+    for thread in prange(threads):
+        tiles, keys, counts = pair_tiles[thread], pair_keys[thread], histogram[thread]
+        counts[:] = 0
+        first, last = len(chunks) * thread // threads, len(chunks) * (thread + 1) // threads
+        splat, pairs = first * CHUNK, 0
+        for place in range(first, last):
+            end = _project_chunk(chunks[place], gaussians, sh, harmonics, antialiased, view, splats, splat)
+            pairs = _list_tiles(splats, splat, end, tiles_x, tiles, keys, pairs, counts)
+            splat = end
+        needed[thread] = pairs
+    return needed
+
+
+@njit
+def _project_chunk(chunk, gaussians, sh, harmonics, antialiased, view, splats, splat):
+    """Write the visible Gaussians of a chunk to `splats` from the record `splat` on; return the record after them."""
+    at = splat * SPLAT_SIZE
+    for group in range(0, CHUNK, LANES):
+        at = _project_group(chunk, group, gaussians, sh, harmonics, antialiased, view, splats, at)
+    return at // SPLAT_SIZE
+
+
+@njit
+def _project_group(chunk, group, gaussians, sh, harmonics, antialiased, view, splats, out):
+    """Write the visible ones among LANES Gaussians of a chunk to `splats` from `out` on; return where they end."""
+    at = chunk * prepare.ROWS * CHUNK + group
+    r = view.rotation
+    ox = load(gaussians, at + prepare.X * CHUNK) - view.origin[0] - view.origin_rest[0]
+    oy = load(gaussians, at + prepare.Y * CHUNK) - view.origin[1] - view.origin_rest[1]
+    oz = load(gaussians, at + prepare.Z * CHUNK) - view.origin[2] - view.origin_rest[2]
+    z = ox * r[2, 0] + oy * r[2, 1] + oz * r[2, 2]
+    inverse_z = _ONE / z
+    u = (ox * r[0, 0] + oy * r[0, 1] + oz * r[0, 2]) * inverse_z
+    v = (ox * r[1, 0] + oy * r[1, 1] + oz * r[1, 2]) * inverse_z
+    px, py = u * view.fx + view.cx, v * view.fy + view.cy
+
+    # Rows of the projection's Jacobian, turned into the splat frame (EWA, eq. 29-31).
+    u, v = (minimum(maximum(u, view.left), view.right), minimum(maximum(v, view.top), view.bottom))
+    sx, sy = view.fx * inverse_z, view.fy * inverse_z
+    ax, ay, az = (sx * (r[0, 0] - u * r[2, 0]), sx * (r[0, 1] - u * r[2, 1]), sx * (r[0, 2] - u * r[2, 2]))
+    bx, by, bz = (sy * (r[1, 0] - v * r[2, 0]), sy * (r[1, 1] - v * r[2, 1]), sy * (r[1, 2] - v * r[2, 2]))
+    sxx, sxy = (load(gaussians, at + prepare.XX * CHUNK), load(gaussians, at + prepare.XY * CHUNK))
+    sxz, syy = (load(gaussians, at + prepare.XZ * CHUNK), load(gaussians, at + prepare.YY * CHUNK))
+    syz, szz = (load(gaussians, at + prepare.YZ * CHUNK), load(gaussians, at + prepare.ZZ * CHUNK))
+    cax, cay, caz = (sxx * ax + sxy * ay + sxz * az, sxy * ax + syy * ay + syz * az, sxz * ax + syz * ay + szz * az)
+    cbx, cby, cbz = (sxx * bx + sxy * by + sxz * bz, sxy * bx + syy * by + syz * bz, sxz * bx + syz * by + szz * bz)
+    cov_xx, cov_xy, cov_yy = (
+        ax * cax + ay * cay + az * caz,
+        bx * cax + by * cay + bz * caz,
+        bx * cbx + by * cby + bz * cbz,
+    )
+    sharp_determinant = cov_xx * cov_yy - cov_xy * cov_xy
+    cov_xx, cov_yy = cov_xx + _EPS2D, cov_yy + _EPS2D
+    determinant = cov_xx * cov_yy - cov_xy * cov_xy
+
+    log_opacity = load(gaussians, at + prepare.LOG_OPACITY * CHUNK)
+    if antialiased:
+        log_opacity = log_opacity + _F(0.5) * log2(maximum(sharp_determinant / determinant, _ZERO))
+    # The ellipse in which alpha is at least MIN_ALPHA, and the pixels in its box.
+    r2 = (log_opacity - _LOG_MIN_ALPHA) * _REACH_SCALE
+    reach_x, reach_y = sqrt(r2 * cov_xx), sqrt(r2 * cov_yy)
+    left, right = (_ceil(maximum(px - reach_x, _ZERO)), floor(minimum(px + reach_x, _F(view.width - 1))))
+    top, bottom = (_ceil(maximum(py - reach_y, _ZERO)), floor(minimum(py + reach_y, _F(view.height - 1))))
+    # Comparisons with NaN are false.
+    finite = (determinant > _ZERO) & (determinant < _INFINITY) & (px < _INFINITY) & (py < _INFINITY)
+    visible = finite & (z > _NEAR) & (r2 >= _ZERO) & (left <= right) & (top <= bottom)
+    if mask_bits(visible) == 0:
+        return out
+
+    scale = _CONIC_SCALE / determinant
+    inverse_distance = _ONE / sqrt(ox * ox + oy * oy + oz * oz)
+    red, green, blue = _colors(
+        sh,
+        chunk * 3 * harmonics[0] * CHUNK + group,
+        harmonics[1],
+        ox * inverse_distance,
+        oy * inverse_distance,
+        oz * inverse_distance,
+    )
+    padding = z
+    return store_columns(
+        splats,
+        out,
+        visible,
+        (
+            px,
+            py,
+            cov_yy * scale,
+            cov_xy * scale * _F(-2),
+            cov_xx * scale,
+            log_opacity,
+            red,
+            green,
+            blue,
+            z,
+            left,
+            right,
+            top,
+            bottom,
+            padding,
+            padding,
+        ),
+    )
+
+
+@njit
+def _ceil(x):
+    return _ZERO - floor(_ZERO - x)
+
+
+@njit
+def _colors(sh, at, harmonics, x, y, z):
+    """Red, green and blue of spherical harmonics in the unit directions x, y, z."""
+    half = spread(_F(0.5))
+    color = _add_harmonic(sh, at, 0, spread(_SH0), (half, half, half))
+    if harmonics > 1:
+        color = _add_harmonic(sh, at, 1, -_SH1 * y, color)
+        color = _add_harmonic(sh, at, 2, _SH1 * z, color)
+        color = _add_harmonic(sh, at, 3, -_SH1 * x, color)
+    if harmonics > 4:
+        xx, yy, zz = x * x, y * y, z * z
+        xy, yz, xz = x * y, y * z, x * z
+        color = _add_harmonic(sh, at, 4, _SH2A * xy, color)
+        color = _add_harmonic(sh, at, 5, -_SH2A * yz, color)
+        color = _add_harmonic(sh, at, 6, _SH2B * (_F(2) * zz - xx - yy), color)
+        color = _add_harmonic(sh, at, 7, -_SH2A * xz, color)
+        color = _add_harmonic(sh, at, 8, _SH2C * (xx - yy), color)
+        if harmonics > 9:
+            color = _add_harmonic(sh, at, 9, -_SH3A * y * (_F(3) * xx - yy), color)
+            color = _add_harmonic(sh, at, 10, _SH3B * xy * z, color)
+            color = _add_harmonic(sh, at, 11, -_SH3C * y * (_F(4) * zz - xx - yy), color)
+            color = _add_harmonic(sh, at, 12, _SH3D * z * (_F(2) * zz - _F(3) * (xx + yy)), color)
+            color = _add_harmonic(sh, at, 13, -_SH3C * x * (_F(4) * zz - xx - yy), color)
+            color = _add_harmonic(sh, at, 14, _SH3E * z * (xx - yy), color)
+            color = _add_harmonic(sh, at, 15, -_SH3A * x * (xx - _F(3) * yy), color)
+    return maximum(color[0], _ZERO), maximum(color[1], _ZERO), maximum(color[2], _ZERO)
+
+
+@njit
+def _add_harmonic(sh, at, k, basis, color):
+    return (
+        color[0] + basis * load_halves(sh, at + (3 * k) * CHUNK),
+        color[1] + basis * load_halves(sh, at + (3 * k + 1) * CHUNK),
+        color[2] + basis * load_halves(sh, at + (3 * k + 2) * CHUNK),
+    )
+
+
+@njit
+def _list_tiles(splats, first, last, tiles_x, tiles, keys, pairs, histogram):
+    """Append the tiles that splats touch to a thread's list, which holds `pairs`; return how many it holds then."""
+    for splat in range(first, last):
+        at = splat * SPLAT_SIZE
+        key = np.uint64(bits_of_float(splats[at + DEPTH])) << np.uint64(32) | np.uint64(splat)
+        left, right = np.int64(splats[at + LEFT]) // TILE, np.int64(splats[at + RIGHT]) // TILE
+        top, bottom = np.int64(splats[at + TOP]) // TILE, np.int64(splats[at + BOTTOM]) // TILE
+        # The ellipse leaves out the corners of its box; in a smaller one that saves less than it takes to find out.
+        has_corners = right - left > 1 and bottom - top > 1
+        for row in range(top, bottom + 1):
+            if has_corners:
+                low, high = max(_F(row * TILE), splats[at + TOP]), min(_F(row * TILE + TILE - 1), splats[at + BOTTOM])
+                band_left, band_right = _ellipse_in_rows(splats, at, low, high)
+                left = np.int64(max(band_left, splats[at + LEFT])) // TILE
+                right = np.int64(min(band_right, splats[at + RIGHT])) // TILE
+            for tile in range(row * tiles_x + left, row * tiles_x + right + 1):
+                if pairs < len(tiles):
+                    tiles[pairs] = tile
+                    keys[pairs] = key
+                histogram[tile] += 1
+                pairs += 1
+    return pairs
+
+
+@njit
+def _ellipse_in_rows(splats, at, first, last):
+    """Leftmost and rightmost x of a splat's ellipse within the rows of pixels `first` to `last`, which it meets."""
+    # a dx^2 + 2 b dx dy + c dy^2 <= level
+    a, b, c = (-splats[at + CONIC_XX], _F(-0.5) * splats[at + CONIC_XY], -splats[at + CONIC_YY])
+    level = splats[at + LOG_OPACITY] - _LOG_MIN_ALPHA
+    low, high = first - splats[at + Y], last - splats[at + Y]
+    widest = math.sqrt(level * c / (a * c - b * b))
+    y_of_rightmost = -b * widest / c  # the leftmost point is its mirror image
+
+    def edge(y):
+        return math.sqrt(max(b * b * y * y - a * (c * y * y - level), _ZERO))
+
+    left = -widest
+    if not low <= -y_of_rightmost <= high:
+        y = low if -y_of_rightmost < low else high
+        left = (-b * y - edge(y)) / a
+    right = widest
+    if not low <= y_of_rightmost <= high:
+        y = low if y_of_rightmost < low else high
+        right = (-b * y + edge(y)) / a
+    return splats[at + X] + left, splats[at + X] + right
