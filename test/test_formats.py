@@ -581,3 +581,10 @@ def test_random_bytes_behind_each_magic(tmp_path, magic, content):
 def test_random_bytes_inside_a_gzip(tmp_path, content, version):
     (tmp_path / "map").write_bytes(gzip.compress(b"NGSP" + struct.pack("<I", version) + content))
     check_damaged(tmp_path / "map")
+
+
+def test_a_text_is_no_splat(tmp_path):
+    path = tmp_path / "map"
+    path.write_text("#!/usr/bin/env python3\n" + 41 * " ")
+    assert path.stat().st_size % 32 == 0
+    refused(path, "looks like a text")

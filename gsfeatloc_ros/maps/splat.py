@@ -15,6 +15,8 @@ from gsfeatloc_ros.maps.gaussian_map import GaussianMap, MapError
 
 _ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("rotation", "u1", 4)])
 
+_TEXT_BYTES = 1024
+
 
 def read_splat(path: Path) -> GaussianMap:
     """Read a map from a .splat file.
@@ -30,6 +32,10 @@ def read_splat(path: Path) -> GaussianMap:
             f"{path}: is none of .ply, .spz, .sog and .splat, or truncated: {size} bytes are no whole number of a "
             f".splat's Gaussians of {_ROW.itemsize} bytes"
         )
+    with path.open("rb") as stream:
+        # Any bytes could be Gaussians, but hundreds of them without an opaque one or a negative number are a text.
+        if stream.read(_TEXT_BYTES).isascii():
+            raise MapError(f"{path}: is none of .ply, .spz, .sog and .splat: it looks like a text")
     check_count(path, count)
     return assemble(path, count, 1, _blocks(path, count))
 

@@ -7,9 +7,11 @@ import logging
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import torch
+# torch takes over a second to import, which a robot that uses SIFT need not wait for.
+if TYPE_CHECKING:
+    import torch
 
 _log = logging.getLogger(__name__)
 
@@ -42,6 +44,8 @@ class Weights:
         Raises:
             WeightsError: the explicit file is missing or holds no weights, or no place has them.
         """
+        import torch
+
         if explicit:
             path = Path(explicit).expanduser()
             return _read(path / self.file_name if path.is_dir() else path)
@@ -92,6 +96,8 @@ def fill(network: torch.nn.Module, state: dict[str, torch.Tensor], name: str, de
 
 def _read(path: Path) -> dict[str, Any]:
     """Read a file that torch.save() wrote, without running code from it."""
+    import torch
+
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:

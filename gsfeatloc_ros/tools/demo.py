@@ -28,7 +28,7 @@ from gsfeatloc_ros.camera import Camera
 from gsfeatloc_ros.geometry import rotation_error_deg, translation_error
 from gsfeatloc_ros.maps.gaussian_map import GaussianMap
 from gsfeatloc_ros.maps.ply import write_ply
-from gsfeatloc_ros.match import MATCHERS
+from gsfeatloc_ros.match import DEFAULT_MATCHER, MATCHERS
 from gsfeatloc_ros.node.bag_player import Answer, Topics, play_bag
 from gsfeatloc_ros.render import Renderer, create_renderer
 from gsfeatloc_ros.simulate import Query, Room, cover, simulate_queries, write_bag
@@ -85,7 +85,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("demo_output"), help="folder of the results (%(default)s)")
     parser.add_argument("--queries", type=int, default=40, help="number of photos (%(default)s)")
-    parser.add_argument("--matcher", choices=sorted(MATCHERS), default="xfeat", help="feature matcher (%(default)s)")
+    parser.add_argument(
+        "--matcher", choices=sorted(MATCHERS), default=DEFAULT_MATCHER, help="of features (%(default)s)"
+    )
     args = parser.parse_args(argv)
     if args.queries < 1:
         parser.error("--queries must be at least 1")

@@ -31,7 +31,7 @@ from gsfeatloc_ros.evaluate.run import METHODS, PRIORS_FILE, Run, Task, draw_pri
 from gsfeatloc_ros.evaluate.scene import load_scene
 from gsfeatloc_ros.evaluate.tables import RunResults, describe, over_seeds, query_table, run_table
 from gsfeatloc_ros.localize import LocalizerOptions
-from gsfeatloc_ros.match import MATCHERS
+from gsfeatloc_ros.match import DEFAULT_MATCHER, MATCHERS
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -225,9 +225,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--matcher",
         type=_names(MATCHERS),
-        default=["xfeat"],
+        default=[DEFAULT_MATCHER],
         metavar="LIST",
-        help=f"local features: {', '.join(MATCHERS)} (default: xfeat)",
+        help=f"local features: {', '.join(MATCHERS)} (default: {DEFAULT_MATCHER})",
     )
     parser.add_argument(
         "--sigma", type=_list(_number(float, 0)), default=[1.0], metavar="LIST", help="scales of the priors' errors"

@@ -26,7 +26,7 @@ from gsfeatloc_ros.evaluate.scene import load_scene
 from gsfeatloc_ros.evaluate.strangers import Stranger, draw_strangers
 from gsfeatloc_ros.localize import Localizer, LocalizerOptions
 from gsfeatloc_ros.maps import load_map
-from gsfeatloc_ros.match import MATCHERS, create_matcher
+from gsfeatloc_ros.match import DEFAULT_MATCHER, MATCHERS, create_matcher
 from gsfeatloc_ros.render import create_renderer
 
 
@@ -51,7 +51,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command and return its exit status: 0 if no photo was given a pose."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scene", type=Path, nargs="+", help="folder as for evaluate")
-    parser.add_argument("--matcher", default="xfeat", help=f"of {', '.join(MATCHERS)}; several separated by commas")
+    parser.add_argument("--matcher", default=DEFAULT_MATCHER, help=f"of {', '.join(MATCHERS)}, or several")
     parser.add_argument("--sigma", type=float, default=1.0, help="scale of the priors' errors (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=0, help="of the priors (default: %(default)s)")
     parser.add_argument("--limit", type=int, default=0, help="only the first photos of each scene; 0 for all")
