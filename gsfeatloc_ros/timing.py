@@ -3,25 +3,30 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 
 class StageClock:
-    """Adds up the wall time of named stages."""
+    """Adds up the time of named stages.
 
-    def __init__(self) -> None:
-        self._start = time.perf_counter()
+    Args:
+        now: the time in seconds: wall time, or e.g. time.process_time.
+    """
+
+    def __init__(self, now: Callable[[], float] = time.perf_counter) -> None:
+        self._now = now
+        self._start = now()
         self._stages: dict[str, float] = {}
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
         """Count the time inside the block as that of the stage `name`."""
-        start = time.perf_counter()
+        start = self._now()
         yield
-        self._stages[name] = self._stages.get(name, 0.0) + time.perf_counter() - start
+        self._stages[name] = self._stages.get(name, 0.0) + self._now() - start
 
     def milliseconds(self) -> dict[str, float]:
         """Milliseconds by stage, and "total" since the clock was made."""
-        total = time.perf_counter() - self._start
+        total = self._now() - self._start
         return {name: 1e3 * seconds for name, seconds in (self._stages | {"total": total}).items()}

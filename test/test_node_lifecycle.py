@@ -9,6 +9,7 @@ import pytest
 from node_harness import (
     TIMEOUT,
     NodeProcess,
+    assert_close,
     connected_client,
     executable,
     info_of,
@@ -26,6 +27,18 @@ def test_service_says_what_is_missing(room_map_file):
         assert "no image yet: publish sensor_msgs/Image on /image" in answer.message
         assert "no camera_info yet: publish sensor_msgs/CameraInfo on /camera_info" in answer.message
         assert "no prior yet: publish geometry_msgs/PoseStamped on /prior" in answer.message
+
+
+def test_answers_from_renders_at_half_the_size(room_map_file, room_camera, room_queries):
+    parameters = {"matcher__name": "sift", "renderer__resolution_scale": 0.5, "renderer__sh_degree": 0}
+    with running_localizer(map__path=room_map_file, **parameters) as process, connected_client() as client:
+        query = room_queries[0]
+        client.send_camera_info(info_of(room_camera))
+        client.send_prior(prior_of(query.T_map_camera_prior))
+        message = rgb_image(query.image)
+        answer = client.attempt(message)
+        assert answer.ok, f"{answer.reason}\n{process.output}"
+        assert_close(client.pose_of(message), query.T_map_camera)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -71,6 +84,8 @@ def assert_clean_end(process: NodeProcess, number: signal.Signals, timeout: floa
         ({"map__path": executable()}, "localizer"),
         ({"matcher__name": "orb", "map__path": "ROOM"}, "'orb' is not one of"),
         ({"renderer__device": "abacus", "map__path": "ROOM"}, "'abacus' is not one of"),
+        ({"renderer__sh_degree": 4, "map__path": "ROOM"}, "renderer.sh_degree"),
+        ({"renderer__resolution_scale": 1.5, "map__path": "ROOM"}, "renderer.resolution_scale"),
         ({"localizer__max_passes": 0, "map__path": "ROOM"}, "localizer.max_passes"),
         ({"localizer__max_reprojection_error": 3, "map__path": "ROOM"}, "expecting type 'DOUBLE'"),
     ],

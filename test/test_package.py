@@ -17,7 +17,7 @@ import yaml
 from ament_index_python.packages import get_package_prefix, get_package_share_directory
 
 from gsfeatloc_ros.localize import LocalizerOptions
-from gsfeatloc_ros.node.parameters import PARAMETERS, Parameter
+from gsfeatloc_ros.node.parameters import PARAMETERS, Parameter, Value
 
 ROOT = Path(__file__).parents[1]
 SOURCES = sorted((ROOT / "gsfeatloc_ros").rglob("*.py"))
@@ -54,7 +54,7 @@ def test_descriptor_says_what_the_parameter_is(parameter):
     assert descriptor.description == parameter.description
     assert descriptor.read_only
     ranges = [*descriptor.integer_range, *descriptor.floating_point_range]
-    if isinstance(parameter.default, str):
+    if isinstance(parameter.default, str | bool | list):
         assert not ranges
     else:
         assert (ranges[0].from_value, ranges[0].to_value) == parameter.bounds
@@ -63,7 +63,12 @@ def test_descriptor_says_what_the_parameter_is(parameter):
 
 def test_readme_has_every_parameter_with_its_default():
     rows = re.findall(r"^\| `([a-z_]+\.[a-z_]+)` \| `([^`]*)` \|", (ROOT / "README.md").read_text(), re.MULTILINE)
-    assert dict(rows) == {name: f'"{value}"' if value == "" else str(value) for name, value in DEFAULTS.items()}
+    assert dict(rows) == {name: readme_text(value) for name, value in DEFAULTS.items()}
+
+
+def readme_text(value: Value) -> str:
+    """As YAML has it, but that only the empty string has quotes."""
+    return str(value).lower() if isinstance(value, bool) else str(value) or '""'
 
 
 def test_every_option_of_the_localizer_is_a_parameter():

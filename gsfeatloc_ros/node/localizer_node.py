@@ -22,9 +22,9 @@ from std_srvs.srv import Trigger
 
 from gsfeatloc_ros.camera import Camera
 from gsfeatloc_ros.estimate import Estimate
-from gsfeatloc_ros.localize import Localizer, LocalizerOptions
+from gsfeatloc_ros.localize import Localizer
 from gsfeatloc_ros.maps import load_map
-from gsfeatloc_ros.match import Matcher, create_matcher
+from gsfeatloc_ros.match import create_matcher
 from gsfeatloc_ros.node.diagnostics import ERROR, OK, WARN, diagnostic_message, evidence, stamp_text
 from gsfeatloc_ros.node.messages import (
     decode_camera,
@@ -34,9 +34,11 @@ from gsfeatloc_ros.node.messages import (
     pose_message,
     validate_image,
 )
-from gsfeatloc_ros.node.parameters import declare_parameters, localizer_options
+from gsfeatloc_ros.node.parameters import declare_parameters, localizer_options, map_alignment
 from gsfeatloc_ros.node.worker import LatestWorker
 from gsfeatloc_ros.render import create_renderer
+from gsfeatloc_ros.render.cache import load_prepared
+from gsfeatloc_ros.warmup import warm_up
 
 # Only the newest image counts, and cameras publish with best effort.
 _NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -92,11 +94,19 @@ class LocalizerNode(Node):
         self._options = localizer_options(values)
         if not values["map.path"]:
             raise ValueError("parameter map.path is empty: set it to a map file (-p map.path:=/path/to/map.ply)")
-        gaussian_map = load_map(values["map.path"])
-        self._renderer = create_renderer(gaussian_map, values["renderer.device"], values["renderer.threads"])
+        load = load_prepared if values["map.cache"] else load_map
+        gaussian_map = load(values["map.path"], map_alignment(values))
+        self._renderer = create_renderer(
+            gaussian_map,
+            values["renderer.device"],
+            values["renderer.threads"],
+            sh_degree=values["renderer.sh_degree"],
+            resolution_scale=values["renderer.resolution_scale"],
+        )
         matcher = create_matcher(values["matcher.name"], values["matcher.weights"], values["matcher.max_features"])
         self._localizer = Localizer(self._renderer, matcher, self._options)
-        self._warm_up(matcher)
+        # Now, not at the first image: it takes long.
+        warm_up(matcher, values["renderer.device"], values["renderer.threads"])
 
         self._worker = LatestWorker(self._attempt)
         self._images_received = 0
@@ -120,7 +130,7 @@ class LocalizerNode(Node):
         # Reentrant: a request that waits for the worker must not hold up the next one.
         self.create_service(Trigger, "~/relocalize", self._on_relocalize, callback_group=ReentrantCallbackGroup())
         self.get_logger().info(
-            f"ready: map {values['map.path']} ({len(gaussian_map)} Gaussians, frame {self._map_frame}), "
+            f"ready: map {values['map.path']} (frame {self._map_frame}), "
             f"matcher {values['matcher.name']}, renderer {values['renderer.device']}, "
             f"topics {image.topic_name} {camera.topic_name} {prior.topic_name} -> {self._pose_publisher.topic_name}"
         )
@@ -137,12 +147,6 @@ class LocalizerNode(Node):
     def unanswered_requests(self) -> int:
         """Number of relocalize requests in progress."""
         return self._unanswered_requests
-
-    def _warm_up(self, matcher: Matcher) -> None:
-        """Compile the kernels and load the networks now, not at the first image."""
-        camera = Camera(320, 240, np.array([[300.0, 0, 159.5], [0, 300.0, 119.5], [0, 0, 1]]))
-        noise = np.random.default_rng(0).integers(0, 256, (camera.height, camera.width, 3), dtype=np.uint8)
-        Localizer(self._renderer, matcher, LocalizerOptions(max_views=1)).localize(noise, camera, np.eye(4))
 
     # Callbacks, in the executor's thread.
 

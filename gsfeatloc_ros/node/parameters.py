@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 
+import numpy as np
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.node import Node
 
+from gsfeatloc_ros.geometry import matrix_from_quaternion
 from gsfeatloc_ros.localize import LocalizerOptions
-from gsfeatloc_ros.match import DEFAULT_MAX_FEATURES, MATCHERS
+from gsfeatloc_ros.maps import Similarity, read_dataparser_transforms
+from gsfeatloc_ros.match import DEFAULT_MATCHER, DEFAULT_MAX_FEATURES, MATCHERS
 
-Value = str | int | float
+Value = str | bool | int | float | list[float]
 
 
 @dataclass(frozen=True)
@@ -21,7 +24,7 @@ class Parameter:
         name: with dots between the groups.
         default: its type is the parameter's type.
         description: what it does, with the unit.
-        bounds: lowest and highest value of a number.
+        bounds: lowest and highest value of a single number.
     """
 
     name: str
@@ -34,7 +37,7 @@ class Parameter:
         descriptor = ParameterDescriptor(description=self.description, read_only=True)
         if isinstance(self.default, float):
             descriptor.floating_point_range = [FloatingPointRange(from_value=self.bounds[0], to_value=self.bounds[1])]
-        elif isinstance(self.default, int):
+        elif isinstance(self.default, int) and not isinstance(self.default, bool):
             descriptor.integer_range = [IntegerRange(from_value=self.bounds[0], to_value=self.bounds[1], step=1)]
         return descriptor
 
@@ -47,9 +50,29 @@ def _option(name: str, description: str, bounds: tuple[float, float]) -> Paramet
 
 
 PARAMETERS = (
-    Parameter("map.path", "", "Path of the 3D Gaussian Splatting map, a .ply file (required)."),
+    Parameter(
+        "map.path",
+        "",
+        "Path of the map (required): "
+        "a .ply, compressed .ply, .splat, .spz or .sog, or the folder of an unbundled .sog.",
+    ),
     Parameter("map.frame_id", "map", "Name of the map's frame: of the prior that is taken and of the pose given."),
-    Parameter("matcher.name", "xfeat", f"Feature matcher: {', '.join(MATCHERS)}."),
+    Parameter("map.scale", 1.0, "Units of the map frame in one unit of the file.", (1e-6, 1e6)),
+    Parameter("map.translation", [0.0, 0.0, 0.0], "Where the file's origin lies in the map frame: x, y, z."),
+    Parameter(
+        "map.rotation", [0.0, 0.0, 0.0, 1.0], "Quaternion x, y, z, w that turns the file's axes into the map frame's."
+    ),
+    Parameter(
+        "map.dataparser_transforms",
+        "",
+        "Path of nerfstudio's dataparser_transforms.json, undone before the three above; empty for none.",
+    ),
+    Parameter(
+        "map.cache",
+        True,
+        "Keep the map, prepared for rendering, in a file beside it (*.gsfeatloc-cache): later starts are faster.",
+    ),
+    Parameter("matcher.name", DEFAULT_MATCHER, f"Feature matcher: {', '.join(MATCHERS)}."),
     Parameter(
         "matcher.weights",
         "",
@@ -58,6 +81,10 @@ PARAMETERS = (
     Parameter("matcher.max_features", DEFAULT_MAX_FEATURES, "Most features taken from an image.", (64, 32768)),
     Parameter("renderer.device", "auto", "Where to render: cpu, or auto to choose."),
     Parameter("renderer.threads", 0, "Threads of the CPU renderer; 0 takes all cores.", (0, 1024)),
+    Parameter("renderer.sh_degree", 3, "Highest degree of the spherical harmonics of the colours drawn.", (0, 3)),
+    Parameter(
+        "renderer.resolution_scale", 1.0, "Draw so many times the width and height, and enlarge that.", (0.1, 1.0)
+    ),
     _option("max_image_width", "Wider images are resized to this many pixels first.", (64, 16384)),
     _option("max_passes", "Most renders at estimates to which an image is tracked.", (1, 20)),
     _option(
@@ -97,6 +124,30 @@ def declare_parameters(node: Node) -> dict[str, Value]:
         parameter.name: node.declare_parameter(parameter.name, parameter.default, parameter.descriptor()).value
         for parameter in PARAMETERS
     }
+
+
+def map_alignment(values: dict[str, Value]) -> Similarity:
+    """Where the frame of the map file lies in the robot's map frame (S_map_splat), from the values of all parameters.
+
+    Raises:
+        ValueError: a parameter is no translation, no quaternion or no file of nerfstudio's; the message says which.
+    """
+    translation = _numbers(values, "map.translation", 3)
+    try:
+        rotation = matrix_from_quaternion(_numbers(values, "map.rotation", 4))
+    except ValueError as error:
+        raise ValueError(f"parameter map.rotation: {error}") from error
+    alignment = Similarity(values["map.scale"], rotation, translation)
+    if not values["map.dataparser_transforms"]:
+        return alignment
+    return alignment @ read_dataparser_transforms(values["map.dataparser_transforms"])
+
+
+def _numbers(values: dict[str, Value], name: str, count: int) -> np.ndarray:
+    numbers = np.array(values[name], dtype=np.float64)
+    if numbers.shape != (count,) or not np.isfinite(numbers).all():
+        raise ValueError(f"parameter {name}: {numbers.tolist()} is not {count} finite numbers")
+    return numbers
 
 
 def localizer_options(values: dict[str, Value]) -> LocalizerOptions:

@@ -1,6 +1,10 @@
 """Figures of the parts that decide how fast and how right an answer is.
 
-    python -m gsfeatloc_ros.tools.benchmark render --scene SCENE --size 640x480
+    python -m gsfeatloc_ros.tools.benchmark synthetic --gaussians 1000000 --out map.ply
+    python -m gsfeatloc_ros.tools.benchmark render --map map.ply --size 640x480 --json frames.json
+    python -m gsfeatloc_ros.tools.benchmark render --scene SCENE
+    python -m gsfeatloc_ros.tools.benchmark query --scene SCENE --matcher xfeat --json query.json
+    python -m gsfeatloc_ros.tools.benchmark scaling --out scaling.png
     python -m gsfeatloc_ros.tools.benchmark pnp
 
 CPU milliseconds count all threads; on a shared machine they, and ratios within one run, mean more than wall time.
@@ -9,124 +13,140 @@ CPU milliseconds count all threads; on a shared machine they, and ratios within 
 from __future__ import annotations
 
 import argparse
+import json
 import sys
-import time
-from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
-import cv2
 import numpy as np
 
-from gsfeatloc_ros.camera import Camera
-from gsfeatloc_ros.evaluate.scene import load_scene
-from gsfeatloc_ros.geometry import (
-    invert,
-    make_pose,
-    random_unit_vector,
-    rotation_error_deg,
-    so3_exp,
-    transform,
-    translation_error,
-)
-from gsfeatloc_ros.maps import load_map
-from gsfeatloc_ros.pose.solve import ransac_pose
-from gsfeatloc_ros.render import create_renderer
-
-_MAX_ERROR = 3.0  # pixels
-_KEYPOINT_NOISE = 0.7  # pixels
-_TRIALS = 50
+from gsfeatloc_ros.benchmark.frames import measure_map, measure_scene, print_frames
+from gsfeatloc_ros.benchmark.measure import machine
+from gsfeatloc_ros.benchmark.pnp import measure_pnp
+from gsfeatloc_ros.benchmark.query import measure_queries, print_queries
+from gsfeatloc_ros.benchmark.scaling import COUNTS, draw_scaling, measure_scaling
+from gsfeatloc_ros.geometry import make_pose, matrix_from_quaternion, quaternion_from_matrix
+from gsfeatloc_ros.maps.ply import write_ply
+from gsfeatloc_ros.match import DEFAULT_MATCHER, MATCHERS
+from gsfeatloc_ros.render import DEVICES
+from gsfeatloc_ros.simulate.two_rooms import VIEWS, two_rooms
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; return the exit status."""
-    parser = argparse.ArgumentParser(prog="benchmark", description="Measure the parts of a localization.")
-    commands = parser.add_subparsers(dest="command", required=True)
-    render = commands.add_parser("render", help="time of a frame, at the poses of a scene's test photos")
-    render.add_argument("--scene", type=Path, required=True, help="folder with map.ply and transforms.json")
-    render.add_argument(
-        "--size", type=_size, default=(640, 480), metavar="WxH", help="of the frames (default: 640x480)"
-    )
-    render.add_argument("--threads", type=int, default=0, help="CPU threads; 0 for one per core")
-    render.set_defaults(run=_render)
-    commands.add_parser("pnp", help="PoseLib against OpenCV's USAC on simulated matches").set_defaults(run=_pnp)
-    options = parser.parse_args(arguments)
+    options = _parser().parse_args(arguments)
     try:
         options.run(options)
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, RuntimeError) as error:
         print(f"benchmark: {error}", file=sys.stderr)
         return 1
     return 0
 
 
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands = parser.add_subparsers(dest="command", required=True)
+    device = argparse.ArgumentParser(add_help=False)
+    device.add_argument("--device", choices=DEVICES, default="auto", help="to render on (default: %(default)s)")
+    device.add_argument("--threads", type=int, default=0, help="CPU threads; 0 for one per core")
+    file = argparse.ArgumentParser(add_help=False)
+    file.add_argument("--json", type=Path, metavar="FILE", help="write the figures here as well")
+
+    render = commands.add_parser("render", parents=[device, file], help="time of a frame, and of loading the map")
+    source = render.add_mutually_exclusive_group(required=True)
+    source.add_argument("--map", type=Path, help="map file: the same frame again and again, and loading it")
+    source.add_argument(
+        "--scene", type=Path, help="folder with a map and photos: a frame at the pose of each test photo"
+    )
+    render.add_argument(
+        "--size", type=_size, default=(640, 480), metavar="WxH", help="of the frames (default: 640x480)"
+    )
+    render.add_argument(
+        "--pose",
+        type=float,
+        nargs=7,
+        metavar=("X", "Y", "Z", "QX", "QY", "QZ", "QW"),
+        help="of the camera (z forward) in the map (default: the whole map in view)",
+    )
+    render.add_argument("--frames", type=int, default=20, help="measured at that pose (default: %(default)s)")
+    render.set_defaults(run=_render)
+
+    query = commands.add_parser("query", parents=[device, file], help="time of a localization, by stage")
+    query.add_argument("--scene", type=Path, required=True, help="folder with a map and photos")
+    query.add_argument(
+        "--matcher", choices=MATCHERS, default=DEFAULT_MATCHER, help="of features (default: %(default)s)"
+    )
+    query.add_argument(
+        "--sigma", type=float, default=1.0, help="scale of the priors' errors; 1 as in the paper (default: %(default)s)"
+    )
+    query.set_defaults(run=_query)
+
+    synthetic = commands.add_parser("synthetic", help="make a map of two rooms to measure on")
+    synthetic.add_argument("--gaussians", type=int, default=1_000_000, help="their number (default: %(default)s)")
+    synthetic.add_argument("--seed", type=int, default=0, help="another one gives another map")
+    synthetic.add_argument("--out", type=Path, required=True, metavar="FILE.ply", help="the map")
+    synthetic.set_defaults(run=_synthetic)
+
+    scaling = commands.add_parser("scaling", parents=[file], help="ms against Gaussians, pixels and threads, as a plot")
+    scaling.add_argument("--out", type=Path, required=True, metavar="FILE.png", help="the plot")
+    scaling.add_argument(
+        "--most", type=int, default=COUNTS[-1], help="of Gaussians; 5 million take 6 GB (default: %(default)s)"
+    )
+    scaling.set_defaults(run=_scaling)
+
+    commands.add_parser("pnp", help="PoseLib against OpenCV's USAC on simulated matches").set_defaults(
+        run=lambda options: measure_pnp()
+    )
+    return parser
+
+
 def _render(options: argparse.Namespace) -> None:
-    scene = load_scene(options.scene)
-    gaussian_map = load_map(scene.map_path)
-    renderer = create_renderer(gaussian_map, threads=options.threads, background=scene.background)
-    camera = scene.camera.scaled(*options.size)
-    renderer.render(camera, scene.photos[0].T_map_camera)  # compiles
-    cpu, wall = zip(*(_timed(renderer.render, camera, p.T_map_camera)[1:] for p in scene.photos), strict=True)
-    print(f"{scene.name}: {len(gaussian_map)} Gaussians, {camera.width}x{camera.height}, {len(cpu)} views")
-    for name, seconds in (("CPU", cpu), ("wall", wall)):
-        print(f"  {name:4} ms per frame: min {1e3 * min(seconds):6.1f}  median {1e3 * np.median(seconds):6.1f}")
+    if options.frames < 1:
+        raise ValueError("--frames must be at least 1")
+    if options.scene:
+        if options.pose:
+            raise ValueError("--pose is for --map; the frames of a scene are at the poses of its photos")
+        report = measure_scene(options.scene, options.size, options.device, options.threads)
+    else:
+        pose = _pose(options.pose) if options.pose else None
+        report = measure_map(options.map, options.size, pose, options.frames, options.device, options.threads)
+    print_frames(report)
+    _write(options.json, report | {"device": options.device, "threads": options.threads})
 
 
-def _pnp(_options: argparse.Namespace) -> None:
-    solvers: dict[str, Callable] = {"PoseLib": _solve_with_poselib, "USAC": _solve_with_usac}
-    print("matches  inliers  solver    failed  wrong   median error           CPU ms: median    max")
-    for count, inlier_ratio in ((800, 0.7), (800, 0.3), (200, 0.3), (300, 0.15), (100, 0.15), (60, 0.3)):
-        for name, solve in solvers.items():
-            errors, times = [], []
-            for seed in range(_TRIALS):
-                camera, pixels, points, truth = _matches(count, inlier_ratio, seed)
-                pose, cpu, _ = _timed(solve, camera, pixels, points, seed)
-                times.append(1e3 * cpu)
-                if pose is not None:
-                    errors.append((rotation_error_deg(pose, truth), translation_error(pose, truth)))
-            rotation, translation = np.transpose(errors)
-            print(
-                f"{count:7}  {inlier_ratio:7.0%}  {name:8}  {_TRIALS - len(errors):6}  {(rotation > 1).sum():5}   "
-                f"{np.median(rotation):.4f} deg  {np.median(translation):.4f} m  "
-                f"{np.median(times):14.1f} {max(times):6.1f}"
-            )
+def _query(options: argparse.Namespace) -> None:
+    report = measure_queries(options.scene, options.matcher, options.sigma, options.device, options.threads)
+    print_queries(report)
+    _write(options.json, report | {"device": options.device, "threads": options.threads})
 
 
-def _matches(count: int, inlier_ratio: float, seed: int) -> tuple[Camera, np.ndarray, np.ndarray, np.ndarray]:
-    """A camera, noisy pixels (N, 2) and points (N, 3) of which a share belongs together, and the true pose."""
-    rng = np.random.default_rng(seed)
-    camera = Camera(640, 426, np.array([[660.0, 0, 319.5], [0, 660.0, 212.5], [0, 0, 1]]))
-    pixels = rng.uniform([0, 0], [639, 425], (count, 2))
-    in_camera = camera.rays(pixels) * rng.uniform(2, 8, (count, 1))
-    pixels += rng.normal(0, _KEYPOINT_NOISE, (count, 2))
-    wrong = rng.random(count) >= inlier_ratio
-    pixels[wrong] = rng.uniform([0, 0], [639, 425], (int(wrong.sum()), 2))
-    truth = make_pose(so3_exp(rng.uniform(0, np.pi) * random_unit_vector(rng)), rng.normal(0, 3, 3))
-    return camera, pixels, transform(truth, in_camera), truth
+def _synthetic(options: argparse.Namespace) -> None:
+    if options.gaussians < 1:
+        raise ValueError("--gaussians must be at least 1")
+    write_ply(options.out, two_rooms(options.gaussians, options.seed))
+    print(f"{options.out}: {options.gaussians} Gaussians. To measure on it:")
+    for name, pose in VIEWS.items():
+        numbers = [*pose[:3, 3], *quaternion_from_matrix(pose[:3, :3])]
+        words = " ".join(f"{number:.4g}" for number in numbers)
+        print(f"  {name:10}  benchmark render --map {options.out} --pose {words}")
 
 
-def _solve_with_poselib(camera: Camera, pixels: np.ndarray, points: np.ndarray, seed: int) -> np.ndarray | None:
-    found = ransac_pose(camera, pixels, points, _MAX_ERROR, seed)
-    return found[0] if found else None
+def _scaling(options: argparse.Namespace) -> None:
+    counts = [count for count in COUNTS if count <= options.most]
+    if not counts:
+        raise ValueError(f"--most must be at least {COUNTS[0]}")
+    rows = measure_scaling(counts)
+    draw_scaling(rows, options.out)
+    _write(options.json, {"rows": rows})
 
 
-def _solve_with_usac(camera: Camera, pixels: np.ndarray, points: np.ndarray, seed: int) -> np.ndarray | None:
-    usac = cv2.UsacParams()
-    usac.threshold, usac.maxIterations, usac.confidence = _MAX_ERROR, 10_000, 0.9999
-    usac.sampler, usac.score = cv2.SAMPLING_UNIFORM, cv2.SCORE_METHOD_MSAC
-    usac.loMethod, usac.loIterations, usac.loSampleSize = cv2.LOCAL_OPTIM_INNER_LO, 10, 50
-    usac.final_polisher, usac.final_polisher_iterations = cv2.LSQ_POLISHER, 10
-    usac.randomGeneratorState = seed
-    try:
-        solved, _, rotation, translation, _ = cv2.solvePnPRansac(points, pixels, camera.K.copy(), None, params=usac)
-    except cv2.error:
-        return None
-    return invert(make_pose(cv2.Rodrigues(rotation)[0], translation.ravel())) if solved else None
+def _write(path: Path | None, report: dict[str, Any]) -> None:
+    if path:
+        path.write_text(json.dumps({"machine": machine()} | report, indent=1) + "\n")
 
 
-def _timed(function: Callable, *arguments: object) -> tuple[object, float, float]:
-    """Result of a call, and its CPU and wall seconds."""
-    cpu, wall = time.process_time(), time.perf_counter()
-    result = function(*arguments)
-    return result, time.process_time() - cpu, time.perf_counter() - wall
+def _pose(numbers: list[float]) -> np.ndarray:
+    return make_pose(matrix_from_quaternion(numbers[3:]), numbers[:3])
 
 
 def _size(text: str) -> tuple[int, int]:

@@ -1,0 +1,168 @@
+"""Frames of a map, and how it is loaded."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsfeatloc_ros.benchmark.measure import memory_taken, spread, timed
+from gsfeatloc_ros.camera import Camera
+from gsfeatloc_ros.evaluate.scene import load_scene
+from gsfeatloc_ros.geometry import make_pose
+from gsfeatloc_ros.maps import GaussianMap, load_map
+from gsfeatloc_ros.render import Renderer, cpu, create_renderer
+from gsfeatloc_ros.render.cache import load_prepared
+from gsfeatloc_ros.timing import StageClock
+from gsfeatloc_ros.warmup import warm_up
+
+Size = tuple[int, int]
+
+_FIELD_OF_VIEW = 65.0  # degrees, horizontal
+# A view of a whole map has this share of the Gaussians on each side of what it looks at.
+_OUTSIDE = 0.05
+# The first frames grow the renderer's buffers.
+_UNCOUNTED = 2
+# The CPU renderer's steps by the functions that do them.
+_STAGES = {"visible_chunks": "cull", "project": "project", "gather": "scatter", "blend": "sort and blend"}
+
+
+def measure_map(
+    path: Path, size: Size, pose: np.ndarray | None, frames: int, device: str, threads: int
+) -> dict[str, Any]:
+    """Load a map, draw the same frame again and again, and load it once more from a cache.
+
+    Args:
+        path: the map.
+        size: width and height of the frame, pixels.
+        pose: (4, 4) T_map_camera; None for one from which the whole map is in view.
+        frames: how many are measured.
+        device, threads: as in create_renderer.
+
+    Raises:
+        ValueError, OSError: the map or the device cannot be used.
+    """
+    warm_up(device=device, threads=threads)
+    renderer, cold = _measure_load(lambda: create_renderer(load_map(path), device, threads))
+    gaussian_map = load_map(path)
+    if pose is None:
+        pose = view_of_all(gaussian_map)
+    report = {
+        "map": path.name,
+        "gaussians": len(gaussian_map),
+        "sh_degree": gaussian_map.sh_degree,
+        "parameters_mb": sum(v.nbytes for v in vars(gaussian_map).values() if isinstance(v, np.ndarray)) / 2**20,
+    }
+    del gaussian_map
+    report |= measure_frames(renderer, pinhole(size), [pose] * frames)
+    del renderer
+    with tempfile.TemporaryDirectory() as folder:
+        cache_path = Path(folder) / "cache"
+        load_prepared(path, cache_path=cache_path)
+        cached = _measure_load(lambda: create_renderer(load_prepared(path, cache_path=cache_path), device, threads))[1]
+    return report | {"load": {"cold": cold, "from_cache": cached}}
+
+
+def _measure_load(load: Callable[[], Renderer]) -> tuple[Renderer, dict[str, float]]:
+    """Load a map, with the seconds and megabytes that it takes."""
+    with memory_taken() as memory:
+        loaded = timed(load)
+    figures = {
+        "seconds": 1e-3 * loaded.wall,
+        "cpu_seconds": 1e-3 * loaded.cpu,
+        "peak_mb": memory.peak,
+        "kept_mb": memory.after,
+    }
+    return loaded.result, figures
+
+
+def measure_scene(path: Path, size: Size, device: str, threads: int) -> dict[str, Any]:
+    """Draw a frame at the pose of each test photo of a scene, with the first one's camera at `size`.
+
+    Raises:
+        ValueError, OSError: the scene or the device cannot be used.
+    """
+    scene = load_scene(path)
+    gaussian_map = load_map(scene.map_path)
+    renderer = create_renderer(gaussian_map, device, threads, scene.background)
+    poses = [photo.T_map_camera for photo in scene.photos]
+    report = {"map": scene.name, "gaussians": len(gaussian_map), "sh_degree": gaussian_map.sh_degree}
+    return report | measure_frames(renderer, scene.camera.scaled(*size), poses)
+
+
+def measure_frames(renderer: Renderer, camera: Camera, poses: list[np.ndarray]) -> dict[str, Any]:
+    """Milliseconds of frames at `poses`, (4, 4) each, also by stage (mean), and how much of the last one is covered."""
+    for pose in poses[:_UNCOUNTED]:
+        renderer.render(camera, pose)
+    frames = [timed(renderer.render, camera, pose) for pose in poses]
+    # Apart from the others, whose time this is not to cost.
+    with _stages_of_frames() as clock:
+        for pose in poses:
+            renderer.render(camera, pose)
+    stages = {name: ms / len(poses) for name, ms in clock.milliseconds().items() if name != "total"}
+    return {
+        "size": [camera.width, camera.height],
+        "frames": len(frames),
+        "cpu_ms": spread([frame.cpu for frame in frames]),
+        "wall_ms": spread([frame.wall for frame in frames]),
+        "stages_cpu_ms": stages,
+        "coverage": float(frames[-1].result.alpha.mean()),
+    }
+
+
+def print_frames(report: dict[str, Any]) -> None:
+    """Print what measure_map or measure_scene found."""
+    width, height = report["size"]
+    print(f"{report['map']}: {report['gaussians']} Gaussians of SH degree {report['sh_degree']}, {width}x{height}")
+    for name, times in (("CPU", report["cpu_ms"]), ("wall", report["wall_ms"])):
+        print(f"  {name:4} ms of {report['frames']} frames: min {times['min']:6.1f}  median {times['median']:6.1f}")
+    stages = ", ".join(f"{name} {milliseconds:.1f}" for name, milliseconds in report["stages_cpu_ms"].items())
+    print(f"  CPU  ms by stage, mean: {stages}")
+    for name, figures in report.get("load", {}).items():
+        print(
+            f"  {name.replace('_', ' ')}: ready to render in {figures['seconds']:.2f} s, at most "
+            f"{figures['peak_mb']:.0f} MB, {figures['kept_mb']:.0f} MB kept "
+            f"(the parameters: {report['parameters_mb']:.0f} MB)"
+        )
+
+
+def pinhole(size: Size) -> Camera:
+    """A camera of width and height `size` with a usual field of view."""
+    width, height = size
+    focal = 0.5 * width / np.tan(np.radians(0.5 * _FIELD_OF_VIEW))
+    return Camera(width, height, np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1.0]]))
+
+
+def view_of_all(gaussian_map: GaussianMap) -> np.ndarray:
+    """Pose (4, 4) T_map_camera, along the z axis of the file, with nearly all of the map in view."""
+    low, high = np.quantile(gaussian_map.means, [_OUTSIDE, 1 - _OUTSIDE], axis=0)
+    distance = np.max(high - low) / np.tan(np.radians(0.5 * _FIELD_OF_VIEW))
+    position = 0.5 * (low + high) - [0, 0, distance]
+    return gaussian_map.S_map_splat.transform_pose(make_pose(np.eye(3), position))
+
+
+@contextmanager
+def _stages_of_frames() -> Iterator[StageClock]:
+    """While this is open, the CPU renderer counts the CPU time of its steps on the clock that it gives."""
+    clock = StageClock(time.process_time)
+
+    def counted(function: Callable, stage: str) -> Callable:
+        def call(*arguments: object) -> object:
+            with clock.stage(stage):
+                return function(*arguments)
+
+        return call
+
+    functions = {name: getattr(cpu, name) for name in _STAGES}
+    try:
+        for name, function in functions.items():
+            setattr(cpu, name, counted(function, _STAGES[name]))
+        yield clock
+    finally:
+        for name, function in functions.items():
+            setattr(cpu, name, function)

@@ -1,0 +1,51 @@
+"""Compile the kernels and fetch a matcher's weights ahead of use, so that a robot's first start is a fast one.
+
+python -m gsfeatloc_ros.tools.warmup
+python -m gsfeatloc_ros.tools.warmup --matcher xfeat
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import time
+from pathlib import Path
+
+import gsfeatloc_ros
+from gsfeatloc_ros.match import MATCHERS, create_matcher
+from gsfeatloc_ros.render import DEVICES
+from gsfeatloc_ros.warmup import warm_up
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command line; return the exit status."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--matcher", choices=MATCHERS, help="get its weights as well, and localize with it once")
+    parser.add_argument("--weights", default="", help="path of the weights, as the parameter matcher.weights")
+    parser.add_argument("--device", choices=DEVICES, default="auto", help="to render on (default: %(default)s)")
+    options = parser.parse_args(arguments)
+    start = time.perf_counter()
+    try:
+        matcher = create_matcher(options.matcher, options.weights) if options.matcher else None
+        loaded = time.perf_counter()
+        done = warm_up(matcher, options.device)
+    except (ValueError, RuntimeError, OSError) as error:
+        print(f"warmup: {error}", file=sys.stderr)
+        return 1
+    compiled = f"{done.compiled} functions compiled" if done.compiled else "all in the cache"
+    print(f"kernels: {compiled}, {done.kernels_seconds:.1f} s; kept in {_cache_folder()}")
+    if matcher is not None:
+        print(f"matcher {options.matcher}: ready in {loaded - start:.1f} s")
+        seconds, estimate = done.localization_seconds, done.estimate
+        print(f"a localization in a made-up map: {estimate.status.value} in {seconds:.1f} s: {estimate.reason}")
+    return 0
+
+
+def _cache_folder() -> str:
+    beside = Path(gsfeatloc_ros.__file__).parent / "render" / "__pycache__"
+    return os.environ.get("NUMBA_CACHE_DIR") or str(beside)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
