@@ -91,7 +91,7 @@ def prepare(gaussian_map: GaussianMap) -> PreparedMap:
 
 def _drawing_order(means: np.ndarray, scales: np.ndarray, opacities: np.ndarray) -> np.ndarray:
     """Indices of the Gaussians that can be seen, neighbours in space beside each other, small ones first."""
-    seen = np.flatnonzero(opacities >= MIN_ALPHA)
+    seen = np.flatnonzero(opacities >= MIN_ALPHA).astype(np.int32)
     if len(seen) == 0:
         return seen
     # Floaters far from everything share the cells at the border, lest all else shares one.
@@ -101,7 +101,7 @@ def _drawing_order(means: np.ndarray, scales: np.ndarray, opacities: np.ndarray)
     cell = max(np.max(high - low), np.finfo(np.float32).tiny) / 2**_MORTON_BITS
     codes = _morton_codes(seen, means, low, cell)
     # Gaussians of like size share chunks: one large one would make a box large for all.
-    sizes = scales[seen].max(axis=1)
+    sizes = scales.max(axis=1)[seen]
     octaves = np.log2(sizes / np.median(sizes)).clip(0, 7).astype(np.uint64)
     codes |= octaves << np.uint64(3 * _MORTON_BITS)
     return seen[np.argsort(codes, kind="stable")]
