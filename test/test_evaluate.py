@@ -35,6 +35,7 @@ from gsfeatloc_ros.evaluate.protocol import (
 )
 from gsfeatloc_ros.evaluate.published import PublishedLocalizer
 from gsfeatloc_ros.evaluate.scene import load_scene
+from gsfeatloc_ros.evaluate.spoil import SPOILERS
 from gsfeatloc_ros.geometry import (
     invert,
     make_pose,
@@ -535,3 +536,22 @@ def test_every_piece_makes_a_difference(piece, room_map, room_camera, room_queri
     assert part.localized, part.reason
     assert not np.array_equal(whole.T_map_camera, part.T_map_camera)
     assert translation_error(part.T_map_camera, query.T_map_camera) < 0.05
+
+
+# Spoilt photos
+
+
+@pytest.mark.parametrize("name", SPOILERS)
+def test_spoilt_photos_are_of_the_same_size_and_worse(name, room_queries):
+    image = room_queries[0].image
+    kept = image.copy()
+    spoilt = SPOILERS[name](image)
+    np.testing.assert_array_equal(image, kept)
+    assert spoilt.shape == image.shape
+    assert spoilt.dtype == np.uint8
+    changed = (spoilt != image).any(axis=2).mean()
+    if name.startswith("cover"):
+        assert changed == pytest.approx(int(name[-2:]) / 100, abs=0.02)
+    else:
+        assert changed > 0.5
+    np.testing.assert_array_equal(SPOILERS[name](image), spoilt)

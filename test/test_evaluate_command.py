@@ -100,16 +100,33 @@ def test_priors_of_another_system(room_scene, queries, tmp_path):
 
 
 def test_options_of_the_localizer_are_changed(room_scene, tmp_path):
-    path = tmp_path / "passes.json"
-    lists = ["--method", "default,published", "--set", "max_passes=1,2", "--set", "max_views=0", "--limit", "1"]
+    path = tmp_path / "inliers.json"
+    lists = ["--method", "default,published", "--set", "min_inliers=20,5000", "--set", "max_views=0", "--limit", "1"]
     assert main([str(room_scene), *QUICK, *lists, "--json", str(path)]) == 0
     runs = read(path)["runs"]
     assert [(run["method"], run["options"]) for run in runs] == [
-        ("default", {"max_passes": 1, "max_views": 0}),
-        ("default", {"max_passes": 2, "max_views": 0}),
+        ("default", {"min_inliers": 20, "max_views": 0}),
+        ("default", {"min_inliers": 5000, "max_views": 0}),
         ("published", {}),
     ]
-    assert [run["per_query"][0]["passes"] for run in runs[:2]] == [1, 2]
+    assert [run["answered"] for run in runs[:2]] == [1, 0]
+
+
+def test_pieces_are_left_out_and_photos_spoilt_one_at_a_time(room_scene, tmp_path):
+    path = tmp_path / "worse.json"
+    lists = ["--without", "nothing,sub-pixel", "--spoil", "nothing,dark", "--limit", "1"]
+    assert main([str(room_scene), *QUICK, "--method", "default,published", *lists, "--json", str(path)]) == 0
+    runs = read(path)["runs"]
+    assert [(run["method"], run["without"], run["spoil"]) for run in runs] == [
+        ("default", "", ""),
+        ("default", "", "dark"),
+        ("default", "sub-pixel", ""),
+        ("default", "sub-pixel", "dark"),
+        ("published", "", ""),
+        ("published", "", "dark"),
+    ]
+    errors = [run["per_query"][0]["rotation_error_deg"] for run in runs]
+    assert len(set(errors)) == len(errors)
 
 
 def test_two_processes_find_what_one_does(room_scene, tmp_path):
@@ -270,6 +287,8 @@ def test_command_writes_its_report(shared, tmp_path, capsys, method):
         "sigma",
         "seed",
         "options",
+        "without",
+        "spoil",
         "queries",
         "success_rate",
         "rotation_error_deg",

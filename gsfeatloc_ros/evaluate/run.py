@@ -19,6 +19,7 @@ from gsfeatloc_ros.evaluate.priors_file import read_priors
 from gsfeatloc_ros.evaluate.protocol import PROTOCOLS, Prior, trajectory_radius
 from gsfeatloc_ros.evaluate.published import PublishedLocalizer
 from gsfeatloc_ros.evaluate.scene import load_scene
+from gsfeatloc_ros.evaluate.spoil import SPOILERS
 from gsfeatloc_ros.localize import Localizer, LocalizerOptions
 from gsfeatloc_ros.maps import load_map
 from gsfeatloc_ros.match import Matcher, create_matcher
@@ -44,6 +45,7 @@ class Run:
         max_width: wider photos are resized to this many pixels.
         options: fields of LocalizerOptions that differ from the default, with their values.
         without: the one of ablation.PIECES that is taken out, or "".
+        spoil: what is made wrong with the photos, one of SPOILERS, or "".
     """
 
     scene: Path
@@ -57,6 +59,7 @@ class Run:
     max_width: int
     options: tuple[tuple[str, float], ...] = ()
     without: str = ""
+    spoil: str = ""
 
     def settings(self) -> dict:
         """The same, ready for JSON."""
@@ -138,6 +141,8 @@ def localize(task: Task, threads: int = 0) -> tuple[QueryResult, Estimate]:
     localizer = _localizer(run, task.version, threads)
     photo = scene.photos[prior.photo]
     image = scene.read_photo(photo)
+    if run.spoil:
+        image = SPOILERS[run.spoil](image)
     start = time.perf_counter()
     with without(run.without, _matcher(run.matcher, threads)):
         if isinstance(localizer, Localizer):

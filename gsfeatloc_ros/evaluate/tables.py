@@ -72,15 +72,18 @@ class Group:
             "seed": run.seed if len(self.members) == 1 else self.seeds,
             "options": dict(run.options),
             "without": run.without,
+            "spoil": run.spoil,
             **self.summary,
         }
 
     @property
     def label(self) -> str:
-        """Method, matcher, changed options and what was left out, in short."""
+        """Method, matcher, changed options, what was left out and what is wrong with the photos, in short."""
         run = self.run
-        left_out = [f"without {run.without}"] if run.without else []
-        return " ".join([run.method, run.matcher, *(f"{name}={value:g}" for name, value in run.options), *left_out])
+        words = [run.method, run.matcher, *(f"{name}={value:g}" for name, value in run.options)]
+        words += [f"without {run.without}"] if run.without else []
+        words += [f"{run.spoil} photos"] if run.spoil else []
+        return " ".join(words)
 
 
 def over_seeds(runs: Sequence[RunResults]) -> list[Group]:

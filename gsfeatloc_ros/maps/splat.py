@@ -33,8 +33,9 @@ def read_splat(path: Path) -> GaussianMap:
             f".splat's Gaussians of {_ROW.itemsize} bytes"
         )
     with path.open("rb") as stream:
-        # Any bytes could be Gaussians, but hundreds of them without an opaque one or a negative number are a text.
-        if stream.read(_TEXT_BYTES).isascii():
+        # Any bytes could be Gaussians, but without a zero, an opaque one and a negative number they are a text.
+        start = stream.read(_TEXT_BYTES)
+        if start.isascii() and b"\0" not in start:
             raise MapError(f"{path}: is none of .ply, .spz, .sog and .splat: it looks like a text")
     check_count(path, count)
     return assemble(path, count, 1, _blocks(path, count))

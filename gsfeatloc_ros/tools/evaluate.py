@@ -29,9 +29,12 @@ from gsfeatloc_ros.evaluate.protocol import PROTOCOLS
 from gsfeatloc_ros.evaluate.record import Fingerprint, Record, fingerprint_of, hash_scene
 from gsfeatloc_ros.evaluate.run import METHODS, PRIORS_FILE, Run, Task, draw_priors, localize_all
 from gsfeatloc_ros.evaluate.scene import load_scene
+from gsfeatloc_ros.evaluate.spoil import SPOILERS
 from gsfeatloc_ros.evaluate.tables import RunResults, describe, over_seeds, query_table, run_table
 from gsfeatloc_ros.localize import LocalizerOptions
 from gsfeatloc_ros.match import DEFAULT_MATCHER, MATCHERS
+
+_NOTHING = "nothing"
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -148,7 +151,8 @@ def _runs(options: argparse.Namespace) -> list[Run]:
             seed=seed,
             max_width=options.max_width,
             options=changed,
-            without="" if without == "nothing" else without,
+            without=without.replace(_NOTHING, ""),
+            spoil=spoil.replace(_NOTHING, ""),
         )
         for scene, map_path in zip(options.scene, maps, strict=True)
         for matcher, method, protocol, sigma, seed in itertools.product(
@@ -156,7 +160,8 @@ def _runs(options: argparse.Namespace) -> list[Run]:
         )
         # The published recipe has no options and is taken whole.
         for changed in (itertools.product(*sets) if method == "default" else [()])
-        for without in (options.without if method == "default" else ["nothing"])
+        for without in (options.without if method == "default" else [_NOTHING])
+        for spoil in options.spoil
     ]
 
 
@@ -245,10 +250,17 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument(
         "--without",
-        type=_names(("nothing", *PIECES)),
-        default=["nothing"],
+        type=_names((_NOTHING, *PIECES)),
+        default=[_NOTHING],
         metavar="LIST",
-        help=f"take a piece out of method default, one at a time: nothing, {', '.join(PIECES)} (default: nothing)",
+        help=f"take a piece out of method default, one at a time: {', '.join(PIECES)} (default: {_NOTHING})",
+    )
+    parser.add_argument(
+        "--spoil",
+        type=_names((_NOTHING, *SPOILERS)),
+        default=[_NOTHING],
+        metavar="LIST",
+        help=f"make something wrong with the photos, one at a time: {', '.join(SPOILERS)} (default: {_NOTHING})",
     )
     parser.add_argument("--limit", type=_number(int, 0), default=0, help="only the first photos; 0 for all")
     parser.add_argument(
