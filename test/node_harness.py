@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 import rclpy
 from ament_index_python.packages import get_package_prefix, get_package_share_directory
@@ -21,7 +22,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from sensor_msgs.msg import CameraInfo, Image
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
@@ -140,7 +141,7 @@ class Diagnostic:
 class Client:
     """A camera and a robot's state estimator, as the localizer sees them, that remember what it published."""
 
-    def __init__(self, name: str = "client") -> None:
+    def __init__(self, name: str = "client", transport: str = "raw") -> None:
         self.poses: dict[str, PoseWithCovarianceStamped] = {}
         self.renders: list[Image] = []
         self.diagnostics: list[Diagnostic] = []
@@ -149,9 +150,11 @@ class Client:
         self.node = rclpy.create_node(name, context=self._context)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self.node)
-        self._image = self.node.create_publisher(Image, "image", 5)
+        image = (Image, "image") if transport == "raw" else (CompressedImage, "image/compressed")
+        self._image = self.node.create_publisher(*image, 5)
         self._camera_info = self.node.create_publisher(CameraInfo, "camera_info", 5)
         self._prior = self.node.create_publisher(PoseStamped, "prior", 5)
+        self._prior_with_covariance = self.node.create_publisher(PoseWithCovarianceStamped, "prior_with_covariance", 5)
         latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self.node.create_subscription(PoseWithCovarianceStamped, "pose", self._on_pose, latched)
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 100)
@@ -176,7 +179,7 @@ class Client:
 
     def connect(self) -> None:
         """Wait until the localizer and this client have found each other."""
-        publishers = (self._image, self._camera_info, self._prior)
+        publishers = (self._image, self._camera_info, self._prior, self._prior_with_covariance)
         found = self.spin_until(
             lambda: (
                 all(publisher.get_subscription_count() == 1 for publisher in publishers)
@@ -199,14 +202,15 @@ class Client:
         # There is no order between topics: what is sent next must not overtake it.
         self.spin(0.2)
 
-    def send_prior(self, message: PoseStamped) -> None:
-        self._prior.publish(message)
+    def send_prior(self, message: PoseStamped | PoseWithCovarianceStamped) -> None:
+        publisher = self._prior if isinstance(message, PoseStamped) else self._prior_with_covariance
+        publisher.publish(message)
         self.spin(0.2)
 
-    def send_image(self, message: Image) -> None:
+    def send_image(self, message: Image | CompressedImage) -> None:
         self._image.publish(message)
 
-    def attempt(self, message: Image) -> Diagnostic:
+    def attempt(self, message: Image | CompressedImage) -> Diagnostic:
         """Send an image until the localizer has said something on it, and return that."""
         message.header.stamp = self.next_stamp()
         return self.until_diagnosed(lambda: self.send_image(message), lambda d: d.values.get("stamp") == text(message))
@@ -253,9 +257,9 @@ class Client:
 
 
 @contextmanager
-def connected_client() -> Iterator[Client]:
+def connected_client(transport: str = "raw") -> Iterator[Client]:
     """A client that has found the localizer."""
-    client = Client()
+    client = Client(transport=transport)
     try:
         client.connect()
         yield client
@@ -273,6 +277,11 @@ def rgb_image(rgb: np.ndarray) -> Image:
     height, width = rgb.shape[:2]
     header = Header(frame_id="camera_optical")
     return Image(header=header, height=height, width=width, encoding="rgb8", step=3 * width, data=rgb.tobytes())
+
+
+def compressed_image(rgb: np.ndarray, extension: str) -> CompressedImage:
+    encoded = cv2.imencode(f".{extension}", rgb[:, :, ::-1])[1]
+    return CompressedImage(header=Header(frame_id="camera_optical"), format=extension, data=encoded.tobytes())
 
 
 def info_of(camera: Camera) -> CameraInfo:

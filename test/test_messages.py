@@ -287,3 +287,34 @@ def test_pose_message_is_the_pose_that_a_prior_would_give(rotation, translation)
     assert message.pose.covariance.tolist() == list(range(36))
     prior = PoseStamped(header=message.header, pose=message.pose.pose)
     assert np.allclose(decode_prior(prior, "map"), pose, atol=1e-9)
+
+
+def test_the_camera_of_a_region_that_is_binned():
+    """A pixel of the image is where the blocks of the whole sensor's pixels put it."""
+    info = CameraInfo(width=640, height=480, k=[500.0, 0, 322, 0, 502, 236, 0, 0, 1], d=[0.1, 0, 0, 0, 0])
+    info.roi.x_offset, info.roi.y_offset, info.roi.width, info.roi.height = 100, 50, 400, 300
+    info.binning_x, info.binning_y = 2, 3
+    camera = decode_camera(info)
+    assert (camera.width, camera.height) == (200, 100)
+    assert camera.distortion[0] == 0.1
+    points = np.array([[0.1, -0.2, 1.0], [0.0, 0.0, 2.0]])
+    whole = points[:, :2] / points[:, 2:] * [500, 502] + [322, 236]
+    np.testing.assert_allclose(camera.project(points), (whole - [100, 50] + 0.5) / [2, 3] - 0.5)
+
+
+def test_rectified_images_have_the_camera_of_p():
+    info = CameraInfo(width=640, height=480, k=[500.0, 0, 322, 0, 502, 236, 0, 0, 1], d=[0.1, 0, 0, 0, 0])
+    info.p = [450.0, 0, 320, -45, 0, 450, 240, 0, 0, 0, 1, 0]
+    camera = decode_camera(info, rectified=True)
+    np.testing.assert_array_equal(camera.K, [[450, 0, 320], [0, 450, 240], [0, 0, 1]])
+    assert not camera.distorted
+    info.p = [0.0] * 12
+    with pytest.raises(ValueError, match="a P of zeros"):
+        decode_camera(info, rectified=True)
+
+
+def test_a_region_outside_of_the_sensor_is_refused():
+    info = CameraInfo(width=640, height=480, k=[500.0, 0, 322, 0, 502, 236, 0, 0, 1])
+    info.roi.x_offset, info.roi.width, info.roi.height = 300, 400, 300
+    with pytest.raises(ValueError, match="outside its 640x480"):
+        decode_camera(info)

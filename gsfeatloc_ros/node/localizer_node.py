@@ -16,7 +16,7 @@ from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import CameraInfo, Image
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
@@ -25,16 +25,17 @@ from gsfeatloc_ros.estimate import Estimate
 from gsfeatloc_ros.localize import Localizer
 from gsfeatloc_ros.maps import load_map
 from gsfeatloc_ros.match import create_matcher
-from gsfeatloc_ros.node.diagnostics import ERROR, OK, WARN, diagnostic_message, evidence, stamp_text
-from gsfeatloc_ros.node.messages import (
+from gsfeatloc_ros.messages import (
     decode_camera,
+    decode_compressed_image,
     decode_image,
     decode_prior,
-    image_message,
-    pose_message,
+    decode_prior_covariance,
     validate_image,
 )
-from gsfeatloc_ros.node.parameters import declare_parameters, localizer_options, map_alignment
+from gsfeatloc_ros.node.diagnostics import ERROR, OK, WARN, diagnostic_message, evidence, stamp_text
+from gsfeatloc_ros.node.messages import image_message, pose_message
+from gsfeatloc_ros.node.parameters import TRANSPORTS, declare_parameters, localizer_options, map_alignment
 from gsfeatloc_ros.node.worker import LatestWorker
 from gsfeatloc_ros.render import create_renderer
 from gsfeatloc_ros.render.cache import load_prepared
@@ -68,6 +69,13 @@ class Newest(Generic[T]):
         return self.value
 
 
+class Prior(NamedTuple):
+    """A rough pose T_map_camera (4, 4), with its covariance (6, 6) or None."""
+
+    T_map_camera: np.ndarray
+    covariance: np.ndarray | None
+
+
 class Outcome(NamedTuple):
     """How an attempt ended, for whoever asked for it."""
 
@@ -91,6 +99,10 @@ class LocalizerNode(Node):
         super().__init__("localizer")
         values = declare_parameters(self)
         self._map_frame = values["map.frame_id"]
+        self._rectified = values["image.rectified"]
+        transport = values["image.transport"]
+        if transport not in TRANSPORTS:
+            raise ValueError(f"parameter image.transport is {transport!r}: set {' or '.join(TRANSPORTS)}")
         self._options = localizer_options(values)
         if not values["map.path"]:
             raise ValueError("parameter map.path is empty: set it to a map file (-p map.path:=/path/to/map.ply)")
@@ -117,14 +129,22 @@ class LocalizerNode(Node):
         self._pose_publisher = self.create_publisher(PoseWithCovarianceStamped, "pose", _LATCHED)
         self._render_publisher = self.create_publisher(Image, "rendered_image", _RELIABLE)
         self._diagnostics_publisher = self.create_publisher(DiagnosticArray, "/diagnostics", _RELIABLE)
-        image = self.create_subscription(Image, "image", self._on_image, _NEWEST)
+        if transport == "compressed":
+            # As image_transport does: a remapping of image holds for it as well.
+            topic = self.resolve_topic_name("image") + "/compressed"
+            image = self.create_subscription(CompressedImage, topic, self._on_image, _NEWEST)
+        else:
+            image = self.create_subscription(Image, "image", self._on_image, _NEWEST)
         camera = self.create_subscription(CameraInfo, "camera_info", self._on_camera_info, _NEWEST)
         prior = self.create_subscription(PoseStamped, "prior", self._on_prior, _RELIABLE)
-        self._image: Newest[Image] = Newest(problem=f"no image yet: publish sensor_msgs/Image on {image.topic_name}")
+        self.create_subscription(PoseWithCovarianceStamped, "prior_with_covariance", self._on_prior, _RELIABLE)
+        self._image: Newest[Image | CompressedImage] = Newest(
+            problem=f"no image yet: publish sensor_msgs/{image.msg_type.__name__} on {image.topic_name}"
+        )
         self._camera: Newest[Camera] = Newest(
             problem=f"no camera_info yet: publish sensor_msgs/CameraInfo on {camera.topic_name}"
         )
-        self._prior: Newest[np.ndarray] = Newest(
+        self._prior: Newest[Prior] = Newest(
             problem=f"no prior yet: publish geometry_msgs/PoseStamped on {prior.topic_name}"
         )
         # Reentrant: a request that waits for the worker must not hold up the next one.
@@ -150,10 +170,11 @@ class LocalizerNode(Node):
 
     # Callbacks, in the executor's thread.
 
-    def _on_image(self, message: Image) -> None:
+    def _on_image(self, message: Image | CompressedImage) -> None:
         self._images_received += 1
         try:
-            validate_image(message)
+            if isinstance(message, Image):
+                validate_image(message)
         except ValueError as error:
             self._image = Newest(problem=str(error))
             self._refuse("image", str(error), message.header.stamp)
@@ -163,14 +184,14 @@ class LocalizerNode(Node):
 
     def _on_camera_info(self, message: CameraInfo) -> None:
         try:
-            self._camera = Newest(decode_camera(message))
+            self._camera = Newest(decode_camera(message, self._rectified))
         except ValueError as error:
             self._camera = Newest(problem=str(error))
             self._refuse("camera_info", str(error), message.header.stamp)
 
-    def _on_prior(self, message: PoseStamped) -> None:
+    def _on_prior(self, message: PoseStamped | PoseWithCovarianceStamped) -> None:
         try:
-            self._prior = Newest(decode_prior(message, self._map_frame))
+            self._prior = Newest(Prior(decode_prior(message, self._map_frame), decode_prior_covariance(message)))
         except ValueError as error:
             self._prior = Newest(problem=str(error))
             self._refuse("prior", str(error), message.header.stamp)
@@ -195,7 +216,7 @@ class LocalizerNode(Node):
 
     # Work, in the worker's thread.
 
-    def _attempt(self, message: Image) -> Outcome:
+    def _attempt(self, message: Image | CompressedImage) -> Outcome:
         """Localize an image and publish what came of it; one diagnostic with its stamp, whatever happens."""
         stamp = message.header.stamp
         try:
@@ -207,20 +228,22 @@ class LocalizerNode(Node):
             self._diagnose(ERROR, "error", reason, {"stamp": stamp_text(stamp)})
             return Outcome(False, reason)
 
-    def _localize(self, message: Image) -> Outcome:
+    def _localize(self, message: Image | CompressedImage) -> Outcome:
         values = {"stamp": stamp_text(message.header.stamp)}
         try:
-            camera, prior, image = self._camera.get(), self._prior.get(), decode_image(message)
-            if (camera.width, camera.height) != (message.width, message.height):
+            camera, prior = self._camera.get(), self._prior.get()
+            image = decode_image(message) if isinstance(message, Image) else decode_compressed_image(message)
+            height, width = image.shape[:2]
+            if (camera.width, camera.height) != (width, height):
                 raise ValueError(
-                    f"camera_info is for {camera.width}x{camera.height} but the image is "
-                    f"{message.width}x{message.height}: publish the camera_info of this image"
+                    f"camera_info is for {camera.width}x{camera.height} but the image is {width}x{height}: publish the "
+                    "camera_info of this image"
                 )
         except ValueError as error:
             self._complain("refused", str(error))
             self._diagnose(ERROR, "refused", str(error), values)
             return Outcome(False, str(error))
-        estimate = self._localizer.localize(image, camera, prior)
+        estimate = self._localizer.localize(image, camera, prior.T_map_camera, prior.covariance)
         if estimate.localized:
             self._publish(estimate, camera, message.header)
         else:

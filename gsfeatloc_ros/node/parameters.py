@@ -13,6 +13,8 @@ from gsfeatloc_ros.localize import LocalizerOptions
 from gsfeatloc_ros.maps import Similarity, read_dataparser_transforms
 from gsfeatloc_ros.match import DEFAULT_MATCHER, DEFAULT_MAX_FEATURES, MATCHERS
 
+TRANSPORTS = ("raw", "compressed")
+
 Value = str | bool | int | float | list[float]
 
 
@@ -71,6 +73,16 @@ PARAMETERS = (
         "map.cache",
         True,
         "Keep the map, prepared for rendering, in a file beside it (*.gsfeatloc-cache): later starts are faster.",
+    ),
+    Parameter(
+        "image.transport",
+        "raw",
+        "How images come: raw (on the topic image), or compressed (JPEG or PNG, on image/compressed).",
+    ),
+    Parameter(
+        "image.rectified",
+        False,
+        "Whether images are rectified: then the camera is that of camera_info's P, without distortion.",
     ),
     Parameter("matcher.name", DEFAULT_MATCHER, f"Feature matcher: {', '.join(MATCHERS)}."),
     Parameter(
