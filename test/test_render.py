@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from dataclasses import replace
+from functools import partial
 
 import numba
 import numpy as np
@@ -11,15 +12,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from gsfeatloc_ros import render as renderers
 from gsfeatloc_ros.camera import Camera
 from gsfeatloc_ros.geometry import make_pose, so3_exp
 from gsfeatloc_ros.maps import GaussianMap, load_map
 from gsfeatloc_ros.maps.gaussian_map import SH_COEFFICIENTS
-from gsfeatloc_ros.render import Render, create_renderer
+from gsfeatloc_ros.render import Render
 from gsfeatloc_ros.render import lanes as simd
 from gsfeatloc_ros.render.base import DEPTH_MIN_ALPHA, MIN_ALPHA
 from gsfeatloc_ros.render.prepare import CHUNK, prepare
 from gsfeatloc_ros.render.reference import ReferenceRenderer
+
+# Also on a machine with a GPU.
+create_renderer = partial(renderers.create_renderer, device="cpu")
 
 SH_C0 = 0.28209479177387814
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from gsfeatloc_ros.maps.gaussian_map import GaussianMap
+from gsfeatloc_ros.render.availability import explain_fallback, gpu_problem
 from gsfeatloc_ros.render.base import Render, Renderer
 
 if TYPE_CHECKING:
@@ -12,7 +13,7 @@ if TYPE_CHECKING:
 
 __all__ = ["DEVICES", "Render", "Renderer", "create_renderer"]
 
-DEVICES = ("auto", "cpu")
+DEVICES = ("auto", "cpu", "cuda")
 
 
 def create_renderer(
@@ -27,18 +28,29 @@ def create_renderer(
 
     Args:
         gaussian_map: the map to draw, as it was read or prepared (render/prepare.py). It need not be kept.
-        device: "cpu", or "auto" for the best that this machine has (at present the CPU).
-        threads: CPU threads to use; 0 for one per core.
+        device: "cpu", "cuda" (needs the extra `gpu`), or "auto" for the best that works on this machine; if that is the
+            CPU, the log says why.
+        threads: CPU threads to use; 0 for one per core. They are of no use to a GPU.
         background: RGB in [0, 1] behind the map.
         sh_degree: degree of the spherical harmonics that are drawn, 0 to 3; those of the map beyond are left out.
         resolution_scale: draw pictures of so many times the width and height, 0.1 to 1, and enlarge them.
 
     Raises:
         ValueError: an unknown device, or a number out of its range.
+        RuntimeError: device "cuda" cannot be used; the message says what is missing and what to do.
     """
     if device not in DEVICES:
         raise ValueError(f"renderer device {device!r} is not one of {', '.join(DEVICES)}")
-    # Imported here: numba takes a second, and users of the protocol alone do not need it.
-    from gsfeatloc_ros.render.cpu import CpuRenderer
+    problem = "" if device == "cpu" else gpu_problem()
+    if device == "cuda" and problem:
+        raise RuntimeError(f"renderer device cuda: {problem}")
+    # Imported here: numba and torch take a second each, and users of the protocol alone do not need them.
+    if device == "cpu" or problem:
+        if problem:
+            explain_fallback(problem)
+        from gsfeatloc_ros.render.cpu import CpuRenderer
 
-    return CpuRenderer(gaussian_map, threads, background, sh_degree, resolution_scale)
+        return CpuRenderer(gaussian_map, threads, background, sh_degree, resolution_scale)
+    from gsfeatloc_ros.render.gpu import GpuRenderer
+
+    return GpuRenderer(gaussian_map, background, sh_degree, resolution_scale)

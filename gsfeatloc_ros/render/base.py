@@ -73,3 +73,9 @@ class SplatRenderer(ABC):
     @abstractmethod
     def _render(self, camera: Camera, T_splat_camera: np.ndarray) -> Render:
         """Draw what `camera` sees from `T_splat_camera` (4, 4), with depths in splat units, in arrays of its own."""
+
+
+def check_range(name: str, value: float, low: float, high: float) -> None:
+    """Raise ValueError where a renderer's parameter is not from `low` to `high`."""
+    if not low <= value <= high:
+        raise ValueError(f"renderer {name} is {value}; it must be from {low} to {high}")

@@ -9,9 +9,9 @@ import numpy as np
 
 from gsfeatloc_ros.camera import Camera
 from gsfeatloc_ros.maps.gaussian_map import SH_COEFFICIENTS, GaussianMap
-from gsfeatloc_ros.render.base import Render, SplatRenderer
+from gsfeatloc_ros.render.base import Render, SplatRenderer, check_range
 from gsfeatloc_ros.render.blend import blend, gather, tile_starts
-from gsfeatloc_ros.render.enlarge import enlarge
+from gsfeatloc_ros.render.enlarge import draw_scaled
 from gsfeatloc_ros.render.prepare import CHUNK, KERNEL_LOCK, PreparedMap, prepare
 from gsfeatloc_ros.render.project import SPLAT_SIZE, TILE, project
 from gsfeatloc_ros.render.view import view_of, visible_chunks
@@ -39,9 +39,9 @@ class CpuRenderer(SplatRenderer):
         Raises:
             ValueError: a number out of its range.
         """
-        _check_range("threads", threads, 0, _MAX_THREADS)
-        _check_range("sh_degree", sh_degree, 0, len(SH_COEFFICIENTS) - 1)
-        _check_range("resolution_scale", resolution_scale, 0.1, 1.0)
+        check_range("threads", threads, 0, _MAX_THREADS)
+        check_range("sh_degree", sh_degree, 0, len(SH_COEFFICIENTS) - 1)
+        check_range("resolution_scale", resolution_scale, 0.1, 1.0)
         super().__init__(gaussian_map)
         prepared = gaussian_map if isinstance(gaussian_map, PreparedMap) else prepare(gaussian_map)
         self._threads = min(threads or _available_cores(), numba.config.NUMBA_NUM_THREADS)
@@ -57,10 +57,7 @@ class CpuRenderer(SplatRenderer):
         self._pairs = _PairBuffers(self._threads, capacity=1 << 16)
 
     def _render(self, camera: Camera, T_splat_camera: np.ndarray) -> Render:
-        if self._resolution_scale == 1.0:
-            return self._draw(camera, T_splat_camera)
-        size = (max(1, round(self._resolution_scale * pixels)) for pixels in (camera.width, camera.height))
-        return enlarge(self._draw(camera.scaled(*size), T_splat_camera), camera.width, camera.height)
+        return draw_scaled(self._draw, camera, T_splat_camera, self._resolution_scale)
 
     def _draw(self, camera: Camera, T_splat_camera: np.ndarray) -> Render:
         with KERNEL_LOCK:
@@ -109,11 +106,6 @@ class _PairBuffers:
         self.tiles = np.empty((threads, capacity), dtype=np.int32)
         self.keys = np.empty((threads, capacity), dtype=np.uint64)
         self.by_tile = np.empty(threads * capacity, dtype=np.uint64)
-
-
-def _check_range(name: str, value: float, low: float, high: float) -> None:
-    if not low <= value <= high:
-        raise ValueError(f"renderer {name} is {value}; it must be from {low} to {high}")
 
 
 def _available_cores() -> int:

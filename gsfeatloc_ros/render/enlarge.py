@@ -2,10 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import cv2
 import numpy as np
 
+from gsfeatloc_ros.camera import Camera
 from gsfeatloc_ros.render.base import Render
+
+
+def draw_scaled(
+    draw: Callable[[Camera, np.ndarray], Render], camera: Camera, T_splat_camera: np.ndarray, scale: float
+) -> Render:
+    """What `draw` draws for a camera of `scale` times the width and height, enlarged to those of `camera`."""
+    if scale == 1.0:
+        return draw(camera, T_splat_camera)
+    size = (max(1, round(scale * pixels)) for pixels in (camera.width, camera.height))
+    return enlarge(draw(camera.scaled(*size), T_splat_camera), camera.width, camera.height)
 
 
 def enlarge(render: Render, width: int, height: int) -> Render:
