@@ -15,15 +15,8 @@ from std_msgs.msg import Header
 
 from gsfeatloc_ros.estimate import Estimate, Status
 from gsfeatloc_ros.geometry import make_pose, so3_exp
-from gsfeatloc_ros.node.messages import (
-    ENCODINGS,
-    decode_camera,
-    decode_image,
-    decode_prior,
-    image_message,
-    pose_message,
-    validate_image,
-)
+from gsfeatloc_ros.messages import ENCODINGS, decode_camera, decode_image, decode_prior, validate_image
+from gsfeatloc_ros.node.messages import image_message, pose_message
 
 # A slow, shared machine is no reason to fail.
 settings.register_profile("unhurried", deadline=None)

@@ -83,7 +83,8 @@ def test_executable_is_where_ros2_run_looks():
 
 def test_share_has_config_and_launch_and_manifest():
     share = Path(get_package_share_directory("gsfeatloc_ros"))
-    for name in ("package.xml", "config/localizer.yaml", "config/fastdds.xml", "launch/localizer.launch.py"):
+    configs = ("config/localizer.yaml", "config/fastdds.xml")
+    for name in ("package.xml", *configs, "launch/localizer.launch.py", "launch/replay.launch.py"):
         assert (share / name).read_text() == (ROOT / name).read_text()
 
 
@@ -131,14 +132,15 @@ def test_import_without_ros():
     subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
 
 
-def test_launch_file_makes_a_description():
-    source = ROOT / "launch" / "localizer.launch.py"
+@pytest.mark.parametrize(("name", "entities"), [("localizer", 7), ("replay", 6)])
+def test_launch_file_makes_a_description(name, entities):
+    source = ROOT / "launch" / f"{name}.launch.py"
     code = compile(source.read_text(), source.name, "exec")
     # launch_ros is in a ROS install only, not among the wheels; without it, that the file compiles is all there is.
     if importlib.util.find_spec("launch_ros"):
         module: dict = {}
         exec(code, module)
-        assert len(module["generate_launch_description"]().entities) == 7
+        assert len(module["generate_launch_description"]().entities) == entities
 
 
 def test_license_is_apache_2():

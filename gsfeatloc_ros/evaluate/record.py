@@ -20,7 +20,7 @@ from gsfeatloc_ros.evaluate.protocol import Prior
 from gsfeatloc_ros.evaluate.run import Run
 
 # Parts of the package that no result depends on.
-_NOT_MEASURED = ("benchmark", "node", "simulate", "tools", "evaluate/report")
+_NOT_MEASURED = ("benchmark", "node", "replay", "simulate", "tools", "evaluate/report")
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,4 @@
-"""ROS messages in and out of the localizer's own types. Nothing here needs a running node.
-
-What comes in is decoded and checked by gsfeatloc_ros/messages.py, which needs no ROS.
-"""
+"""ROS messages out of the localizer's own types. What comes in is decoded by gsfeatloc_ros/messages.py."""
 
 from __future__ import annotations
 
@@ -14,18 +11,6 @@ from std_msgs.msg import Header
 
 from gsfeatloc_ros.estimate import Estimate
 from gsfeatloc_ros.geometry import quaternion_from_matrix
-from gsfeatloc_ros.messages import ENCODINGS, MAX_SIDE, decode_camera, decode_image, decode_prior, validate_image
-
-__all__ = [
-    "ENCODINGS",
-    "MAX_SIDE",
-    "decode_camera",
-    "decode_image",
-    "decode_prior",
-    "image_message",
-    "pose_message",
-    "validate_image",
-]
 
 
 def image_message(rgb: np.ndarray, header: Header) -> Image:

@@ -26,15 +26,17 @@ def nanoseconds(stamp: float) -> int:
     return round(stamp * 1e9)
 
 
-def write_bag(path: str | Path, camera: Camera, queries: Sequence[Query]) -> None:
-    """Write a new rosbag2 folder (mcap): of each query its prior, camera info and image, and the true pose.
+def write_bag(
+    path: str | Path, camera: Camera, queries: Sequence[Query], storage: StoragePlugin = StoragePlugin.MCAP
+) -> None:
+    """Write a new rosbag2 folder: of each query its prior, camera info and image, and the true pose.
 
     All four carry the query's stamp; images are rgb8, poses PoseStamped in the frame `map`.
 
     Raises:
         rosbags.rosbag2.WriterError: the path exists.
     """
-    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+    with Writer(path, version=9, storage_plugin=storage) as writer:
         connections = {
             topic: writer.add_connection(topic, message_type, typestore=_TYPES)
             for topic, message_type in (

@@ -14,11 +14,10 @@ from __future__ import annotations
 import argparse
 import itertools
 import json
-import math
 import shlex
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 
 from tqdm import tqdm
@@ -31,8 +30,8 @@ from gsfeatloc_ros.evaluate.run import METHODS, PRIORS_FILE, Run, Task, draw_pri
 from gsfeatloc_ros.evaluate.scene import load_scene
 from gsfeatloc_ros.evaluate.spoil import SPOILERS
 from gsfeatloc_ros.evaluate.tables import RunResults, describe, over_seeds, query_table, run_table
-from gsfeatloc_ros.localize import LocalizerOptions
 from gsfeatloc_ros.match import DEFAULT_MATCHER, MATCHERS
+from gsfeatloc_ros.tools.options import Settings, localizer_options, number, setting
 
 _NOTHING = "nothing"
 
@@ -235,18 +234,18 @@ def _parser() -> argparse.ArgumentParser:
         help=f"local features: {', '.join(MATCHERS)} (default: {DEFAULT_MATCHER})",
     )
     parser.add_argument(
-        "--sigma", type=_list(_number(float, 0)), default=[1.0], metavar="LIST", help="scales of the priors' errors"
+        "--sigma", type=_list(number(float, 0)), default=[1.0], metavar="LIST", help="scales of the priors' errors"
     )
     parser.add_argument(
-        "--seed", type=_list(_number(int, 0)), default=[0], metavar="LIST", help="seeds of the priors and of RANSAC"
+        "--seed", type=_list(number(int, 0)), default=[0], metavar="LIST", help="seeds of the priors and of RANSAC"
     )
     parser.add_argument(
         "--set",
-        type=_setting,
+        type=setting(_list),
         default={},
-        action=_Settings,
+        action=Settings,
         metavar="OPTION=LIST",
-        help=f"change an option of method default: {', '.join(_localizer_options())}",
+        help=f"change an option of method default: {', '.join(localizer_options())}",
     )
     parser.add_argument(
         "--without",
@@ -262,11 +261,11 @@ def _parser() -> argparse.ArgumentParser:
         metavar="LIST",
         help=f"make something wrong with the photos, one at a time: {', '.join(SPOILERS)} (default: {_NOTHING})",
     )
-    parser.add_argument("--limit", type=_number(int, 0), default=0, help="only the first photos; 0 for all")
+    parser.add_argument("--limit", type=number(int, 0), default=0, help="only the first photos; 0 for all")
     parser.add_argument(
-        "--max-width", type=_number(int, 1), default=640, help="resize wider photos (default: %(default)s)"
+        "--max-width", type=number(int, 1), default=640, help="resize wider photos (default: %(default)s)"
     )
-    parser.add_argument("--jobs", type=_number(int, 1), help="processes (default: joblib.parallel_config's, or 1)")
+    parser.add_argument("--jobs", type=number(int, 1), help="processes (default: joblib.parallel_config's, or 1)")
     parser.add_argument("--json", type=Path, help="write the results to this file")
     parser.add_argument("--report", type=Path, metavar="DIR", help="write a report, index.html, into this folder")
     return parser
@@ -281,28 +280,6 @@ def _check(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None
         parser.error(f"--map: {len(options.map)} maps for {len(options.scene)} scenes")
     if (options.priors is not None) != (PRIORS_FILE in options.protocol):
         parser.error(f"--priors and --protocol {PRIORS_FILE} need each other")
-
-
-class _Settings(argparse.Action):
-    """Collects OPTION=LIST pairs in a dictionary."""
-
-    def __call__(self, parser: object, namespace: argparse.Namespace, values: tuple, option: object = None) -> None:
-        namespace.set = namespace.set | dict([values])
-
-
-def _localizer_options() -> dict[str, type]:
-    """Names and types of what --set changes."""
-    own = ("max_image_width", "seed")  # have options of the command of their own
-    kinds = {field.name: type(field.default) for field in fields(LocalizerOptions) if field.name not in own}
-    return {name: kind for name, kind in kinds.items() if kind in (int, float)}
-
-
-def _setting(text: str) -> tuple[str, list[float]]:
-    name, equals, values = text.partition("=")
-    kinds = _localizer_options()
-    if not equals or name not in kinds:
-        raise argparse.ArgumentTypeError(f"{text} is not OPTION=VALUE with an option out of {', '.join(kinds)}")
-    return name, _list(_number(kinds[name], -math.inf))(values)
 
 
 def _names(known: Sequence[str]) -> Callable[[str], list[str]]:
@@ -332,19 +309,6 @@ def _list(parse: Callable[[str], float]) -> Callable[[str], list[float]]:
         return list(dict.fromkeys(values))
 
     return parse_list
-
-
-def _number(kind: Callable[[str], float], minimum: float) -> Callable[[str], float]:
-    def parse(text: str) -> float:
-        try:
-            value = kind(text)
-        except ValueError:
-            value = math.nan
-        if not (math.isfinite(value) and value >= minimum):
-            raise argparse.ArgumentTypeError(f"{text!r} is not a number of at least {minimum}")
-        return value
-
-    return parse
 
 
 if __name__ == "__main__":

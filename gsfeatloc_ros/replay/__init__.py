@@ -1,0 +1,1 @@
+"""A recorded bag through the localizer, without a ROS graph."""

@@ -1,0 +1,50 @@
+"""The true trajectory of the camera, where it was recorded."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections.abc import Iterable
+
+import numpy as np
+
+from gsfeatloc_ros.geometry import make_pose, so3_exp, so3_log
+
+# Between poses farther apart than this many seconds the truth is not known.
+MAX_GAP = 0.25
+
+
+class Trajectory:
+    """Poses over time.
+
+    Args:
+        poses: stamps in nanoseconds with T_map_camera (4, 4), in any order; of two with the same stamp the last counts.
+    """
+
+    def __init__(self, poses: Iterable[tuple[int, np.ndarray]]) -> None:
+        by_stamp = dict(poses)
+        self._stamps = sorted(by_stamp)
+        self._poses = [by_stamp[stamp] for stamp in self._stamps]
+
+    def __len__(self) -> int:
+        return len(self._stamps)
+
+    @property
+    def positions(self) -> np.ndarray:
+        """(N, 3), in the order of the stamps."""
+        return np.array([pose[:3, 3] for pose in self._poses]).reshape(-1, 3)
+
+    def at(self, stamp: int) -> np.ndarray | None:
+        """The pose (4, 4) at a stamp in nanoseconds.
+
+        Between two poses the translation is interpolated linearly and the rotation along the shortest way (slerp). None
+        outside the trajectory, and between two poses that are more than MAX_GAP apart.
+        """
+        after = bisect_left(self._stamps, stamp)
+        if after < len(self) and self._stamps[after] == stamp:
+            return self._poses[after]
+        if after in (0, len(self)) or self._stamps[after] - self._stamps[after - 1] > 1e9 * MAX_GAP:
+            return None
+        first, last = self._poses[after - 1], self._poses[after]
+        share = (stamp - self._stamps[after - 1]) / (self._stamps[after] - self._stamps[after - 1])
+        rotation = first[:3, :3] @ so3_exp(share * so3_log(first[:3, :3].T @ last[:3, :3]))
+        return make_pose(rotation, (1 - share) * first[:3, 3] + share * last[:3, 3])
