@@ -21,6 +21,11 @@ def set_kernel_cache() -> None:
     os.environ["NUMBA_CACHE_DIR"] = str(folder) if can_write(folder) else tempfile.mkdtemp(prefix="gsfeatloc_ros-")
 
 
+def kernel_cache_folder() -> Path:
+    """Where numba keeps compiled kernels, once set_kernel_cache was called."""
+    return Path(os.environ.get("NUMBA_CACHE_DIR") or _BESIDE_SOURCES)
+
+
 def user_cache_folder() -> Path:
     """This package's folder under $XDG_CACHE_HOME or ~/.cache; it need not exist."""
     root = os.environ.get("XDG_CACHE_HOME", "")

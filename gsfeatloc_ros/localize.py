@@ -135,11 +135,12 @@ class Localizer:
             max_error, seed = options.max_reprojection_error, options.seed
             return look(self._renderer, self._matcher, features, small.camera, poses, max_error, seed, clock)
 
-        seen: list[MatchedView] = []
+        views, best = 0, None
         rejected: Estimate | None = None
         for batch in self._batches(query):
             looked = look_from(batch)
-            seen += looked
+            views += len(looked)
+            best = max(filter(None, (best, looked[0])), key=lambda view: view.inliers)
             for view in promising(looked):
                 if view.inliers < STRONG_HINT:
                     view = look_from([view.solution.T_map_camera])[0]
@@ -147,9 +148,9 @@ class Localizer:
                         continue
                 estimate = self._refine(query, view.solution.T_map_camera)
                 if estimate.localized:
-                    return replace(estimate, views=len(seen) - 1)
+                    return replace(estimate, views=views - 1)
                 rejected = rejected or estimate
-        return replace(rejected or _nothing_in_common(len(features), seen), views=len(seen) - 1)
+        return replace(rejected or _nothing_in_common(len(features), best, views), views=views - 1)
 
     def _batches(self, query: _Query) -> Iterator[list[np.ndarray]]:
         """Poses (4, 4) to look from: the prior alone, then those around it, a few at a time."""
@@ -250,10 +251,9 @@ class _Query:
         return float(np.sqrt(max(step @ np.linalg.solve(covariance, step), 0.0)))
 
 
-def _nothing_in_common(features: int, views: list[MatchedView]) -> Estimate:
-    """None of the views, of which the first is the prior's, suggested a pose."""
-    best = max(views, key=lambda view: view.inliers)
-    where = "at the prior" if len(views) == 1 else f"at the prior and in {len(views) - 1} views around it"
+def _nothing_in_common(features: int, best: MatchedView, views: int) -> Estimate:
+    """None of the views, of which the first was the prior's, suggested a pose; `best` had the most inliers."""
+    where = "at the prior" if views == 1 else f"at the prior and in {views - 1} views around it"
     return Estimate(
         Status.FAILED,
         f"photo and renders {where} have nothing in common: {features} features in the photo, at best {best.matches} "

@@ -9,7 +9,7 @@ A message may be one of rclpy or one that rosbags read from a bag: all that coun
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -22,6 +22,13 @@ Image = CompressedImage = CameraInfo = PoseStamped = PoseWithCovarianceStamped =
 
 # No camera is larger; a message that says so is corrupt.
 MAX_SIDE = 16384
+
+
+class Prior(NamedTuple):
+    """A rough pose T_map_camera (4, 4), with its covariance (6, 6) in ROS order or None."""
+
+    T_map_camera: np.ndarray
+    covariance: np.ndarray | None
 
 
 @dataclass(frozen=True)

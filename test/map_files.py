@@ -1,4 +1,7 @@
-"""Writers of map files, one Gaussian after another, independent of the readers in gsfeatloc_ros/maps."""
+"""Writers of map files, one Gaussian after another, independent of the readers in gsfeatloc_ros/maps.
+
+And what damaged files must come to, of whatever format.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ import gzip
 import json
 import math
 import struct
+import tracemalloc
 import zipfile
 from pathlib import Path
 
@@ -13,8 +17,9 @@ import cv2
 import numpy as np
 from backports import zstd
 
-from gsfeatloc_ros.maps import GaussianMap
+from gsfeatloc_ros.maps import GaussianMap, MapError, load_map
 
+ARRAYS = ("means", "scales", "rotations", "opacities", "sh")
 SH_C0 = 0.28209479177387814
 # Signs of the harmonics 0 to 15 turned by half a turn about x: minus for an odd power of y and z together.
 FLIPPED = [0, 1, 1, 0, 1, 0, 0, 1, 0, 1, 0, 1, 1, 0, 1, 0]
@@ -233,3 +238,24 @@ def bundle(path: Path, folder: Path) -> Path:
         for file in sorted(folder.iterdir()):
             archive.write(file, file.name)
     return path
+
+
+def check_damaged(path: Path, peak_limit: float) -> None:
+    """A damaged file is refused with a MapError, or read as a valid map, without taking memory beyond its size.
+
+    At most `peak_limit` bytes are taken.
+    """
+    tracemalloc.start()
+    try:
+        gaussian_map = load_map(path)
+    except MapError:
+        gaussian_map = None
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < peak_limit
+    if gaussian_map is not None:
+        assert len(gaussian_map) > 0
+        for name in ARRAYS:
+            assert np.isfinite(getattr(gaussian_map, name)).all()
+        assert (gaussian_map.scales > 0).all()
+        np.testing.assert_allclose(np.linalg.norm(gaussian_map.rotations, axis=1), 1.0, atol=1e-5)

@@ -125,6 +125,19 @@ def running_localizer(**parameters: object) -> Iterator[NodeProcess]:
         process.end()
 
 
+def assert_start_fails(says: str, **parameters: object) -> None:
+    """With these parameters the localizer ends with status 1 and one fatal line that says so."""
+    process = NodeProcess(*node_arguments(**parameters))
+    try:
+        assert process.wait(TIMEOUT) == 1
+        lines = process.output.strip().splitlines()
+        assert len(lines) == 1, process.output
+        assert says in lines[0]
+        assert "[FATAL]" in lines[0]
+    finally:
+        process.end()
+
+
 @dataclass(frozen=True)
 class Diagnostic:
     """One status of the localizer."""

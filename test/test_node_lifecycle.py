@@ -7,9 +7,9 @@ import time
 
 import pytest
 from node_harness import (
-    TIMEOUT,
     NodeProcess,
     assert_close,
+    assert_start_fails,
     connected_client,
     executable,
     info_of,
@@ -92,12 +92,4 @@ def assert_clean_end(process: NodeProcess, number: signal.Signals, timeout: floa
 )
 def test_start_that_cannot_be_says_why_in_one_line(room_map_file, parameters, says):
     values = {name: room_map_file if value == "ROOM" else value for name, value in parameters.items()}
-    process = NodeProcess(*node_arguments(**values))
-    try:
-        assert process.wait(TIMEOUT) == 1
-        lines = process.output.strip().splitlines()
-        assert len(lines) == 1, process.output
-        assert says in lines[0]
-        assert "[FATAL]" in lines[0]
-    finally:
-        process.end()
+    assert_start_fails(says, **values)

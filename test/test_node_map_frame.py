@@ -7,12 +7,10 @@ import json
 import numpy as np
 import pytest
 from node_harness import (
-    TIMEOUT,
-    NodeProcess,
+    assert_start_fails,
     connected_client,
     info_of,
     matrix_of,
-    node_arguments,
     prior_of,
     rgb_image,
     running_localizer,
@@ -98,12 +96,4 @@ def test_answers_are_in_the_frame_of_the_robot(room_map_file, room_camera, room_
     ],
 )
 def test_frame_that_is_none_ends_the_start_with_one_line(room_map_file, name, value, says):
-    process = NodeProcess(*node_arguments(map__path=room_map_file, **{name: value}))
-    try:
-        assert process.wait(TIMEOUT) == 1
-        lines = process.output.strip().splitlines()
-        assert len(lines) == 1, process.output
-        assert says in lines[0]
-        assert "[FATAL]" in lines[0]
-    finally:
-        process.end()
+    assert_start_fails(says, map__path=room_map_file, **{name: value})

@@ -8,7 +8,6 @@ from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import Generic, NamedTuple, TypeVar
 
-import numpy as np
 import rclpy.task
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
@@ -26,6 +25,7 @@ from gsfeatloc_ros.localize import Localizer
 from gsfeatloc_ros.maps import load_map
 from gsfeatloc_ros.match import create_matcher
 from gsfeatloc_ros.messages import (
+    Prior,
     decode_camera,
     decode_compressed_image,
     decode_image,
@@ -67,13 +67,6 @@ class Newest(Generic[T]):
         if self.value is None:
             raise ValueError(self.problem)
         return self.value
-
-
-class Prior(NamedTuple):
-    """A rough pose T_map_camera (4, 4), with its covariance (6, 6) or None."""
-
-    T_map_camera: np.ndarray
-    covariance: np.ndarray | None
 
 
 class Outcome(NamedTuple):

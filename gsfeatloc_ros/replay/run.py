@@ -13,6 +13,7 @@ from gsfeatloc_ros.camera import Camera
 from gsfeatloc_ros.estimate import Estimate
 from gsfeatloc_ros.localize import Localizer
 from gsfeatloc_ros.messages import (
+    Prior,
     decode_camera,
     decode_compressed_image,
     decode_image,
@@ -51,12 +52,6 @@ class Answer:
         return self.estimate is not None and self.estimate.localized
 
 
-@dataclass(frozen=True, eq=False)
-class _Prior:
-    T_map_camera: np.ndarray
-    covariance: np.ndarray | None
-
-
 class Replay:
     """Localizes every image of a bag with the camera_info and the prior that were recorded last before it.
 
@@ -78,7 +73,7 @@ class Replay:
         self._bag, self._localizer, self._map_frame, self._rectified = bag, localizer, map_frame, rectified
         # Or what is wrong with the newest.
         self._camera: Camera | str = "no camera_info was recorded before this image"
-        self._prior: _Prior | str = "no prior was recorded before this image"
+        self._prior: Prior | str = "no prior was recorded before this image"
         self.truth: list[tuple[int, np.ndarray]] = []
         self.unusable: Counter[tuple[str, str]] = Counter()
 
@@ -106,7 +101,7 @@ class Replay:
         if recorded.role == "camera_info":
             self._camera = decode_camera(message, self._rectified)
         elif recorded.role == "prior":
-            self._prior = _Prior(decode_prior(message, self._map_frame), decode_prior_covariance(message))
+            self._prior = Prior(decode_prior(message, self._map_frame), decode_prior_covariance(message))
         else:
             self.truth.append((_nanoseconds(message), decode_pose(message, self._map_frame, "truth")))
 

@@ -7,12 +7,10 @@ python -m gsfeatloc_ros.tools.warmup --matcher xfeat
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 import time
-from pathlib import Path
 
-import gsfeatloc_ros
+from gsfeatloc_ros.kernel_cache import kernel_cache_folder
 from gsfeatloc_ros.match import MATCHERS, create_matcher
 from gsfeatloc_ros.render import DEVICES
 from gsfeatloc_ros.warmup import warm_up
@@ -34,17 +32,12 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"warmup: {error}", file=sys.stderr)
         return 1
     compiled = f"{done.compiled} functions compiled" if done.compiled else "all in the cache"
-    print(f"kernels: {compiled}, {done.kernels_seconds:.1f} s; kept in {_cache_folder()}")
+    print(f"kernels: {compiled}, {done.kernels_seconds:.1f} s; kept in {kernel_cache_folder()}")
     if matcher is not None:
         print(f"matcher {options.matcher}: ready in {loaded - start:.1f} s")
         seconds, estimate = done.localization_seconds, done.estimate
         print(f"a localization in a made-up map: {estimate.status.value} in {seconds:.1f} s: {estimate.reason}")
     return 0
-
-
-def _cache_folder() -> str:
-    beside = Path(gsfeatloc_ros.__file__).parent / "render" / "__pycache__"
-    return os.environ.get("NUMBA_CACHE_DIR") or str(beside)
 
 
 if __name__ == "__main__":
