@@ -100,6 +100,33 @@ def quaternion_from_matrix(rotation: np.ndarray) -> np.ndarray:
     return -q if q[3] < 0 else q
 
 
+def interpolate(pose_a: np.ndarray, pose_b: np.ndarray, share: float) -> np.ndarray:
+    """The pose (4, 4) at `share` of the way from one pose to another: straight, and turning evenly about one axis."""
+    turn = so3_log(pose_a[:3, :3].T @ pose_b[:3, :3])
+    translation = (1 - share) * pose_a[:3, 3] + share * pose_b[:3, 3]
+    return make_pose(pose_a[:3, :3] @ so3_exp(share * turn), translation)
+
+
+def rotate_covariance(covariance: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+    """Covariance (6, 6) of a pose about the axes of frame a, from that about the axes of frame b and R_a_b (3, 3)."""
+    both = np.kron(np.eye(2), rotation)
+    return both @ covariance @ both.T
+
+
+def shift_covariance(covariance: np.ndarray, lever: np.ndarray) -> np.ndarray:
+    """Covariance (6, 6) of the pose of another point of the same body.
+
+    To first order: a small rotation w moves the point at `lever` by w x lever.
+
+    Args:
+        covariance: (6, 6) in ROS order (x y z, rotation about x y z).
+        lever: (3,) from the point that the covariance is of to the other, about the same axes.
+    """
+    jacobian = np.eye(6)
+    jacobian[:3, 3:] = -skew(lever)
+    return jacobian @ covariance @ jacobian.T
+
+
 def random_unit_vector(rng: np.random.Generator) -> np.ndarray:
     """Direction (3,) uniform on the sphere."""
     vector = rng.normal(size=3)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -89,6 +89,7 @@ class Localizer:
         camera: Camera,
         T_map_camera_prior: np.ndarray,
         prior_covariance: np.ndarray | None = None,
+        interrupted: Callable[[], bool] = lambda: False,
     ) -> Estimate:
         """Localize a photo.
 
@@ -98,8 +99,10 @@ class Localizer:
             T_map_camera_prior: (4, 4) rough pose of the camera (optical axes) in the map frame.
             prior_covariance: (6, 6) of the prior: where views are searched. In ROS order (x y z, rotation about x y z),
                 axes of the map frame, map units and radians. None for that of the options.
+            interrupted: whether to give up, asked every few tens of milliseconds.
 
         Raises:
+            Interrupted: `interrupted` said so.
             ValueError: the image is not 8-bit RGB of the camera's size, the prior not a finite (4, 4) pose or its
                 covariance not a finite (6, 6) matrix.
         """
@@ -113,7 +116,7 @@ class Localizer:
             prior_covariance = self._options.prior_covariance()
         if np.shape(prior_covariance) != (6, 6) or not np.isfinite(prior_covariance).all():
             raise ValueError("the prior's covariance must be a finite 6x6 matrix")
-        clock = StageClock()
+        clock = StageClock(interrupted=interrupted)
         with clock.stage("prepare"):
             photo = Photo.undistorted(image, camera, self._options.max_image_width)
         prior = np.asarray(T_map_camera_prior, dtype=np.float64)

@@ -9,7 +9,7 @@ A message may be one of rclpy or one that rosbags read from a bag: all that coun
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
@@ -18,17 +18,10 @@ from gsfeatloc_ros.camera import Camera
 from gsfeatloc_ros.geometry import make_pose, matrix_from_quaternion
 
 # Messages by the names of their types; not imported, for ROS may not be installed.
-Image = CompressedImage = CameraInfo = PoseStamped = PoseWithCovarianceStamped = Odometry = Any
+Image = CompressedImage = CameraInfo = PoseStamped = PoseWithCovarianceStamped = Odometry = Time = Any
 
 # No camera is larger; a message that says so is corrupt.
 MAX_SIDE = 16384
-
-
-class Prior(NamedTuple):
-    """A rough pose T_map_camera (4, 4), with its covariance (6, 6) in ROS order or None."""
-
-    T_map_camera: np.ndarray
-    covariance: np.ndarray | None
 
 
 @dataclass(frozen=True)
@@ -189,24 +182,23 @@ def decode_camera(message: CameraInfo, rectified: bool = False) -> Camera:
         raise ValueError(f"camera_info cannot be used: {error}") from error
 
 
-def decode_prior(message: PoseStamped | PoseWithCovarianceStamped, map_frame: str) -> np.ndarray:
-    """Pose T_map_camera (4, 4) of a prior; see decode_pose."""
-    return decode_pose(message, map_frame, "prior")
+def decode_picture(message: Image | CompressedImage) -> np.ndarray:
+    """Pixels (H, W, 3) uint8 RGB of an image message of either type.
+
+    Raises:
+        ValueError: see decode_image and decode_compressed_image.
+    """
+    return decode_compressed_image(message) if hasattr(message, "format") else decode_image(message)
 
 
-def decode_pose(message: PoseStamped | PoseWithCovarianceStamped | Odometry, map_frame: str, name: str) -> np.ndarray:
-    """Pose T_map_camera (4, 4) of a message that gives the camera's optical frame in the frame `map_frame`.
+def decode_pose(message: PoseStamped | PoseWithCovarianceStamped | Odometry, name: str) -> np.ndarray:
+    """Pose (4, 4) of a message in the frame that its header names.
 
     A quaternion that is not of unit length is normalised. `name` is what errors call the message.
 
     Raises:
-        ValueError: another frame, a value that is not finite, or a quaternion of zeros.
+        ValueError: a value that is not finite, or a quaternion of zeros.
     """
-    if message.header.frame_id != map_frame:
-        raise ValueError(
-            f"{name} is in frame {message.header.frame_id!r} but the map is in {map_frame!r}: transform it, or set "
-            "map.frame_id"
-        )
     pose = getattr(message.pose, "pose", message.pose)
     position, orientation = pose.position, pose.orientation
     translation = np.array([position.x, position.y, position.z])
@@ -221,8 +213,8 @@ def decode_pose(message: PoseStamped | PoseWithCovarianceStamped | Odometry, map
         raise ValueError(f"{name} cannot be used: {error}") from error
 
 
-def decode_prior_covariance(message: PoseStamped | PoseWithCovarianceStamped) -> np.ndarray | None:
-    """Covariance (6, 6) of a prior, in ROS order; None for a prior without one, or with zeros, the mark of unknown.
+def decode_covariance(message: PoseStamped | PoseWithCovarianceStamped, name: str) -> np.ndarray | None:
+    """Covariance (6, 6) of a pose, in ROS order; None for a pose without one, or with zeros, the mark of unknown.
 
     Raises:
         ValueError: a value that is not finite, or a negative variance.
@@ -232,5 +224,10 @@ def decode_prior_covariance(message: PoseStamped | PoseWithCovarianceStamped) ->
         return None
     covariance = np.array(values, dtype=np.float64).reshape(6, 6)
     if not np.isfinite(covariance).all() or covariance.diagonal().min() < 0:
-        raise ValueError(f"prior has covariance {covariance.tolist()}: all must be finite, and no variance negative")
+        raise ValueError(f"{name} has covariance {covariance.tolist()}: all must be finite, and no variance negative")
     return covariance
+
+
+def nanoseconds(stamp: Time) -> int:
+    """A stamp in nanoseconds."""
+    return stamp.sec * 1_000_000_000 + stamp.nanosec

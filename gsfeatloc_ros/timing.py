@@ -7,21 +7,31 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 
+class Interrupted(Exception):  # noqa: N818 - it is no error
+    """The work was given up on request."""
+
+
 class StageClock:
     """Adds up the time of named stages.
 
     Args:
         now: the time in seconds: wall time, or e.g. time.process_time.
+        interrupted: whether to give up; asked before each stage, which then raises Interrupted.
     """
 
-    def __init__(self, now: Callable[[], float] = time.perf_counter) -> None:
+    def __init__(
+        self, now: Callable[[], float] = time.perf_counter, interrupted: Callable[[], bool] = lambda: False
+    ) -> None:
         self._now = now
+        self._interrupted = interrupted
         self._start = now()
         self._stages: dict[str, float] = {}
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
         """Count the time inside the block as that of the stage `name`."""
+        if self._interrupted():
+            raise Interrupted
         start = self._now()
         yield
         self._stages[name] = self._stages.get(name, 0.0) + self._now() - start

@@ -20,7 +20,10 @@ from ament_index_python.packages import get_package_prefix, get_package_share_di
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
+from rcl_interfaces.msg import SetParametersResult
+from rcl_interfaces.srv import GetParameters, SetParameters
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_msgs.msg import Header
@@ -78,6 +81,14 @@ class NodeProcess:
         with self._printed:
             found = self._printed.wait_for(lambda: re.search(pattern, "".join(self._lines)), timeout)
         assert found, f"no {pattern!r} in {timeout:g} s in the output:\n{self.output}"
+
+    @property
+    def alive(self) -> bool:
+        return self._process.poll() is None
+
+    @property
+    def pid(self) -> int:
+        return self._process.pid
 
     def signal(self, number: signal.Signals) -> None:
         self._process.send_signal(number)
@@ -158,6 +169,10 @@ class Client:
         self.poses: dict[str, PoseWithCovarianceStamped] = {}
         self.renders: list[Image] = []
         self.diagnostics: list[Diagnostic] = []
+        # What the localizer said of its health, and of its map.
+        self.health: list[Diagnostic] = []
+        self.maps: list[Diagnostic] = []
+        self._publishers: dict[str, rclpy.publisher.Publisher] = {}
         self._context = rclpy.Context()
         rclpy.init(context=self._context)
         self.node = rclpy.create_node(name, context=self._context)
@@ -206,6 +221,46 @@ class Client:
     def listen_to_renders(self) -> None:
         self.node.create_subscription(Image, "rendered_image", self.renders.append, 5)
 
+    def listen(self, message_type: type, topic: str) -> list:
+        """The messages that come on a topic from now on, as they come."""
+        messages: list = []
+        self.node.create_subscription(message_type, topic, messages.append, 10)
+        return messages
+
+    def publisher(self, topic: str, message_type: type) -> rclpy.publisher.Publisher:
+        """A publisher on a topic that the localizer listens to."""
+        if topic not in self._publishers:
+            self._publishers[topic] = self.node.create_publisher(message_type, topic, 10)
+            heard = self.spin_until(lambda: self._publishers[topic].get_subscription_count() > 0)
+            assert heard, f"nobody listens to {topic}"
+        return self._publishers[topic]
+
+    def publish(self, topic: str, message: object) -> None:
+        """Publish on a topic that the localizer listens to."""
+        self.publisher(topic, type(message)).publish(message)
+        self.spin(0.2)
+
+    def call(self, service_type: type, name: str, request: object, timeout: float = TIMEOUT) -> object:
+        """What a service answers."""
+        client = self.node.create_client(service_type, name)
+        try:
+            assert self.spin_until(client.service_is_ready), f"there is no service {name}"
+            future = client.call_async(request)
+            assert self.spin_until(future.done, timeout), f"no answer from {name}"
+            return future.result()
+        finally:
+            self.node.destroy_client(client)
+
+    def set_parameter(self, name: str, value: object) -> SetParametersResult:
+        """Set a parameter of the localizer while it runs."""
+        request = SetParameters.Request(parameters=[Parameter(name, value=value).to_parameter_msg()])
+        return self.call(SetParameters, "localizer/set_parameters", request).results[0]
+
+    def parameter(self, name: str) -> object:
+        """The value of a parameter of the localizer."""
+        answer = self.call(GetParameters, "localizer/get_parameters", GetParameters.Request(names=[name]))
+        return parameter_value_to_python(answer.values[0])
+
     def next_stamp(self) -> Time:
         """A stamp that no client used before."""
         return Time(sec=next(_SECONDS), nanosec=123456789)
@@ -222,6 +277,17 @@ class Client:
 
     def send_image(self, message: Image | CompressedImage) -> None:
         self._image.publish(message)
+
+    def send_once(self, rgb: np.ndarray) -> Image:
+        """Send an image of pixels (H, W, 3) with a new stamp, and say what was sent."""
+        image = rgb_image(rgb)
+        image.header.stamp = self.next_stamp()
+        self.send_image(image)
+        return image
+
+    def is_tried(self, image: Image, timeout: float = 3.0) -> bool:
+        """Whether the localizer says something on an image before the timeout."""
+        return self.spin_until(lambda: any(d.values.get("stamp") == text(image) for d in self.diagnostics), timeout)
 
     def attempt(self, message: Image | CompressedImage) -> Diagnostic:
         """Send an image until the localizer has said something on it, and return that."""
@@ -265,8 +331,13 @@ class Client:
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
             values = {item.key: item.value for item in status.values}
-            if status.name == "localizer: localization":
-                self.diagnostics.append(Diagnostic(status.level, status.message, values))
+            said = {
+                "localizer: localization": self.diagnostics,
+                "localizer: health": self.health,
+                "localizer: map": self.maps,
+            }
+            if status.name in said:
+                said[status.name].append(Diagnostic(status.level, status.message, values))
 
 
 @contextmanager

@@ -3,32 +3,37 @@
 from __future__ import annotations
 
 import threading
+from dataclasses import replace
 
 import rclpy
 from node_harness import assert_close, connected_client, info_of, node_arguments, prior_of, rgb_image
+from rclpy.lifecycle import TransitionCallbackReturn
 
 from gsfeatloc_ros.node.localizer_node import LocalizerNode
 
 
 class OutOfMemoryOnce:
-    """A localizer whose first image goes wrong in a way that nobody foresaw."""
+    """A renderer whose first picture goes wrong in a way that nobody foresaw."""
 
-    def __init__(self, localizer) -> None:
-        self._localizer = localizer
+    def __init__(self, renderer) -> None:
+        self._renderer = renderer
         self._calls = 0
 
-    def localize(self, *arguments):
+    def render(self, *arguments):
         self._calls += 1
         if self._calls == 1:
             raise MemoryError("Unable to allocate 3 TiB")
-        return self._localizer.localize(*arguments)
+        return self._renderer.render(*arguments)
 
 
 def test_unforeseen_exception_is_reported_and_survived(room_map_file, room_camera, room_queries):
     query = room_queries[0]
     rclpy.init(args=node_arguments(map__path=room_map_file, matcher__name="sift"))
     node = LocalizerNode()
-    node._localizer = OutOfMemoryOnce(node._localizer)
+    assert node.trigger_configure() == TransitionCallbackReturn.SUCCESS
+    engine = node.session.engine
+    node.session.use_map(replace(engine, renderer=OutOfMemoryOnce(engine.renderer)))
+    node.trigger_activate()
     spinning = threading.Thread(target=rclpy.spin, args=(node,))
     spinning.start()
     try:
@@ -44,7 +49,7 @@ def test_unforeseen_exception_is_reported_and_survived(room_map_file, room_camer
             assert client.attempt(image).ok
             assert_close(client.pose_of(image), query.T_map_camera)
     finally:
-        assert node.stop(10.0)
+        assert node.session.stop(10.0)
         rclpy.shutdown()
         spinning.join(10.0)
         node.destroy_node()

@@ -102,8 +102,8 @@ def zero_quaternion_prior(prior):
     return prior
 
 
-def odom_prior(prior):
-    prior.header.frame_id = "odom"
+def nowhere_prior(prior):
+    prior.header.frame_id = ""
     return prior
 
 
@@ -112,7 +112,7 @@ def odom_prior(prior):
     [
         (nan_prior, "prior has position .* must be finite"),
         (zero_quaternion_prior, "prior cannot be used: quaternion .* has no direction"),
-        (odom_prior, "prior is in frame 'odom' but the map is in 'map'"),
+        (nowhere_prior, "prior is in frame '': name the frame"),
     ],
 )
 def test_prior_that_cannot_be_used(client, localizer, good_info, good_prior, query, spoil, says):
@@ -120,6 +120,14 @@ def test_prior_that_cannot_be_used(client, localizer, good_info, good_prior, que
     bad = spoil(prior_of(query.T_map_camera_prior))
     assert client.until_refused(lambda: client.send_prior(bad), says)
     assert_no_answer(client, localizer, rgb_image(query.image), says)
+    client.send_prior(good_prior)
+    assert_answer(client, query)
+
+
+def test_prior_in_a_frame_that_nobody_knows(client, localizer, good_info, good_prior, query):
+    client.send_camera_info(good_info)
+    client.send_prior(prior_of(query.T_map_camera_prior, "odom"))
+    assert_no_answer(client, localizer, rgb_image(query.image), "prior is in frame 'odom' but the map is in 'map': tf")
     client.send_prior(good_prior)
     assert_answer(client, query)
 

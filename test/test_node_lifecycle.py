@@ -6,7 +6,10 @@ import signal
 import time
 
 import pytest
+from lifecycle_msgs.msg import State, Transition
+from lifecycle_msgs.srv import ChangeState, GetState
 from node_harness import (
+    Client,
     NodeProcess,
     assert_close,
     assert_start_fails,
@@ -18,6 +21,8 @@ from node_harness import (
     rgb_image,
     running_localizer,
 )
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import Image
 
 
 def test_service_says_what_is_missing(room_map_file):
@@ -93,3 +98,69 @@ def assert_clean_end(process: NodeProcess, number: signal.Signals, timeout: floa
 def test_start_that_cannot_be_says_why_in_one_line(room_map_file, parameters, says):
     values = {name: room_map_file if value == "ROOM" else value for name, value in parameters.items()}
     assert_start_fails(says, **values)
+
+
+def state(client: Client) -> int:
+    return client.call(GetState, "localizer/get_state", GetState.Request()).current_state.id
+
+
+def change(client: Client, transition: int) -> bool:
+    request = ChangeState.Request(transition=Transition(id=transition))
+    return client.call(ChangeState, "localizer/change_state", request, 180.0).success
+
+
+def test_a_lifecycle_manager_drives_it(room_map_file, room_camera, room_queries):
+    query = room_queries[0]
+    process = NodeProcess(*node_arguments(map__path=room_map_file, autostart=False))
+    client = Client()
+    try:
+        assert state(client) == State.PRIMARY_STATE_UNCONFIGURED
+        # Twice: what is cleaned up can be configured again.
+        for _ in range(2):
+            assert change(client, Transition.TRANSITION_CONFIGURE)
+            assert state(client) == State.PRIMARY_STATE_INACTIVE
+            answer = client.relocalize()
+            assert not answer.success
+            assert "not active" in answer.message
+            assert change(client, Transition.TRANSITION_ACTIVATE)
+            client.connect()
+            client.send_camera_info(info_of(room_camera))
+            client.send_prior(prior_of(query.T_map_camera_prior))
+            image = rgb_image(query.image)
+            assert client.attempt(image).ok
+            assert_close(client.pose_of(image), query.T_map_camera)
+            assert change(client, Transition.TRANSITION_DEACTIVATE)
+            assert not client.is_tried(client.send_once(query.image), 1.0)
+            assert change(client, Transition.TRANSITION_CLEANUP)
+            assert state(client) == State.PRIMARY_STATE_UNCONFIGURED
+        assert change(client, Transition.TRANSITION_UNCONFIGURED_SHUTDOWN)
+        assert "Traceback" not in process.output
+    finally:
+        client.close()
+        process.end()
+
+
+def test_a_map_that_cannot_be_loaded_leaves_it_unconfigured(tmp_path, room_map_file):
+    process = NodeProcess(*node_arguments(map__path=tmp_path / "none.ply", autostart=False))
+    client = Client()
+    try:
+        assert not change(client, Transition.TRANSITION_CONFIGURE)
+        assert state(client) == State.PRIMARY_STATE_UNCONFIGURED
+        process.wait_for_output(r"\[FATAL\].*none.ply")
+        assert client.set_parameter("map.path", str(room_map_file)).successful
+        assert change(client, Transition.TRANSITION_CONFIGURE)
+    finally:
+        client.close()
+        process.end()
+
+
+def test_a_publisher_that_does_not_fit_is_told(room_map_file):
+    # Reliable is asked for, best effort is offered.
+    overrides = {"qos_overrides./image.subscription.reliability": "reliable"}
+    with running_localizer(map__path=room_map_file, **overrides) as process:
+        client = Client()
+        try:
+            client.node.create_publisher(Image, "image", QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
+            process.wait_for_output("a publisher on /image offers another reliability than is asked for")
+        finally:
+            client.close()

@@ -27,16 +27,19 @@ by_name = pytest.mark.parametrize("parameter", PARAMETERS, ids=lambda parameter:
 
 def yaml_lines(parameter: Parameter) -> tuple[str, str]:
     """The comment above a parameter in config/localizer.yaml, and its value."""
-    group, name = parameter.name.split(".")
-    text = (ROOT / "config" / "localizer.yaml").read_text()
-    section = re.search(rf"^    {group}:\n((?:      .*\n)+)", text, re.MULTILINE)[1]
-    comment, value = re.search(rf"      # (.*)\n      {name}: (.*)\n", section).groups()
+    group, _, name = parameter.name.rpartition(".")
+    text, indent = (ROOT / "config" / "localizer.yaml").read_text(), "    "
+    if group:
+        text, indent = re.search(rf"^    {group}:\n((?:      .*\n)+)", text, re.MULTILINE)[1], "      "
+    comment, value = re.search(rf"^{indent}# (.*)\n{indent}{name}: (.*)\n", text, re.MULTILINE).groups()
     return comment, value
 
 
 def test_yaml_has_every_parameter_with_its_default():
-    groups = yaml.safe_load((ROOT / "config" / "localizer.yaml").read_text())["/**"]["ros__parameters"]
-    values = {f"{group}.{name}": value for group, names in groups.items() for name, value in names.items()}
+    tree = yaml.safe_load((ROOT / "config" / "localizer.yaml").read_text())["/**"]["ros__parameters"]
+    values = {name: value for name, value in tree.items() if not isinstance(value, dict)}
+    groups = {name: value for name, value in tree.items() if isinstance(value, dict)}
+    values |= {f"{group}.{name}": value for group, names in groups.items() for name, value in names.items()}
     assert values == DEFAULTS
     assert {name: type(value) for name, value in values.items()} == {n: type(v) for n, v in DEFAULTS.items()}
 
@@ -45,14 +48,14 @@ def test_yaml_has_every_parameter_with_its_default():
 def test_yaml_comment_is_the_description_with_the_range(parameter):
     comment, _ = yaml_lines(parameter)
     bounds = f" {parameter.bounds[0]} to {parameter.bounds[1]}." if parameter.bounds else ""
-    assert comment == parameter.description + bounds
+    assert comment == parameter.description + bounds + (" Also at run time." if parameter.live else "")
 
 
 @by_name
 def test_descriptor_says_what_the_parameter_is(parameter):
     descriptor = parameter.descriptor()
     assert descriptor.description == parameter.description
-    assert descriptor.read_only
+    assert descriptor.read_only != parameter.live
     ranges = [*descriptor.integer_range, *descriptor.floating_point_range]
     if isinstance(parameter.default, str | bool | list):
         assert not ranges
@@ -62,8 +65,10 @@ def test_descriptor_says_what_the_parameter_is(parameter):
 
 
 def test_readme_has_every_parameter_with_its_default():
-    rows = re.findall(r"^\| `([a-z_]+\.[a-z_]+)` \| `([^`]*)` \|", (ROOT / "README.md").read_text(), re.MULTILINE)
-    assert dict(rows) == {name: readme_text(value) for name, value in DEFAULTS.items()}
+    section = (ROOT / "README.md").read_text().split("## Parameters")[1].split("\n## ")[0]
+    rows = re.findall(r"^\| `([a-z_.]+)` \| `([^`]*)` \| (\*)?", section, re.MULTILINE)
+    assert {name: default for name, default, _ in rows} == {n: readme_text(v) for n, v in DEFAULTS.items()}
+    assert {name for name, _, star in rows if star} == {parameter.name for parameter in PARAMETERS if parameter.live}
 
 
 def readme_text(value: Value) -> str:
@@ -106,6 +111,9 @@ def test_package_xml_names_every_ros_package_that_is_imported():
     named = {element.text for element in manifest if element.tag.endswith("depend")}
     for source in [*SOURCES, *(ROOT / "launch").glob("*.py")]:
         for package in imported(source):
+            # Our own interfaces are optional, and in a folder of this package, where rosdep cannot find them.
+            if package == "gsfeatloc_interfaces":
+                continue
             if package.endswith(("_msgs", "_srvs", "_interfaces")) or package in ("rclpy", "launch", "launch_ros"):
                 assert package in named, f"{source.name} imports {package}"
 

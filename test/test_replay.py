@@ -18,10 +18,11 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from gsfeatloc_ros.geometry import make_pose, quaternion_from_matrix, so3_exp
+from gsfeatloc_ros.inputs import PriorPolicy
 from gsfeatloc_ros.localize import Localizer, LocalizerOptions
 from gsfeatloc_ros.maps import load_map
 from gsfeatloc_ros.match import create_matcher
-from gsfeatloc_ros.messages import decode_compressed_image, decode_prior_covariance
+from gsfeatloc_ros.messages import decode_compressed_image, decode_covariance
 from gsfeatloc_ros.node.bag_player import Topics, play_bag
 from gsfeatloc_ros.render import create_renderer
 from gsfeatloc_ros.replay.bag import open_bag
@@ -262,7 +263,9 @@ def test_other_types_of_messages(room_camera, room_queries, room_map_file, tmp_p
         (TRUTH, odometry(100.1, query.T_map_camera @ step)),
         (TRUTH, odometry(99.9, query.T_map_camera @ np.linalg.inv(step))),
     ]
-    assert main(arguments(write(tmp_path / "bag", messages), room_map_file, tmp_path / "out")) == 0
+    # The prior is a hundred seconds older than the images.
+    bag, limit = write(tmp_path / "bag", messages), ("--prior-max-age", "0")
+    assert main(arguments(bag, room_map_file, tmp_path / "out", *limit)) == 0
     jpeg, png = rows_of(tmp_path / "out")
     assert (jpeg["status"], png["status"]) == ("localized", "localized")
     assert float(jpeg["rotation_error_deg"]) < 0.5
@@ -314,7 +317,7 @@ def test_images_are_paired_with_the_newest(localizer, small_camera, tmp_path_fac
     }
     bag = write(tmp_path_factory.mktemp("bag") / "bag", messages, storage, kinds)
     with open_bag(bag, TOPICS) as opened:
-        replay = Replay(opened, localizer, "map")
+        replay = Replay(opened, localizer, PriorPolicy())
         answers = iter(list(replay.answers()))
     info = prior = None
     unusable = 0
@@ -547,9 +550,9 @@ def test_compressed_images_keep_their_colour(red, green, blue, suffix):
 def test_covariance_of_a_prior():
     covariance = np.diag([1.0, 2, 3, 0.1, 0.2, 0.3])
     covariance[0, 5] = covariance[5, 0] = 0.05
-    assert np.array_equal(decode_prior_covariance(pose_with_covariance(0, np.eye(4), covariance)), covariance)
-    assert decode_prior_covariance(pose_with_covariance(0, np.eye(4), np.zeros((6, 6)))) is None
-    assert decode_prior_covariance(pose_stamped(0, np.eye(4))) is None
+    assert np.array_equal(decode_covariance(pose_with_covariance(0, np.eye(4), covariance), "prior"), covariance)
+    assert decode_covariance(pose_with_covariance(0, np.eye(4), np.zeros((6, 6))), "prior") is None
+    assert decode_covariance(pose_stamped(0, np.eye(4)), "prior") is None
     for wrong in (np.nan, -1.0):
         with pytest.raises(ValueError, match="finite, and no variance negative"):
-            decode_prior_covariance(pose_with_covariance(0, np.eye(4), np.diag([wrong, 1, 1, 1, 1, 1.0])))
+            decode_covariance(pose_with_covariance(0, np.eye(4), np.diag([wrong, 1, 1, 1, 1, 1.0])), "prior")

@@ -1,30 +1,39 @@
-"""One worker thread, newest item first."""
+"""One worker thread: requests first, then the newest of what is offered."""
 
 from __future__ import annotations
 
 import threading
+import time
 from concurrent.futures import CancelledError
 
 import pytest
 
-from gsfeatloc_ros.node.worker import LatestWorker
+from gsfeatloc_ros.node.worker import Worker
+from gsfeatloc_ros.timing import Interrupted
 
 TIMEOUT = 10.0
 
 
 class Gate:
-    """Work that says when it has started and waits until it is let go."""
+    """Work that says when it has started, and waits until it is let go or interrupted."""
 
     def __init__(self) -> None:
         self.started = threading.Semaphore(0)
         self.go = threading.Semaphore(0)
         self.items = []
 
-    def __call__(self, item):
+    def __call__(self, item, interrupted):
         self.items.append(item)
         self.started.release()
-        assert self.go.acquire(timeout=TIMEOUT)
+        deadline = time.monotonic() + TIMEOUT
+        while not self.go.acquire(timeout=0.01):
+            assert time.monotonic() < deadline
+            if interrupted():
+                raise Interrupted
         return f"did {item}"
+
+    def wait_until_started(self):
+        assert self.started.acquire(timeout=TIMEOUT)
 
 
 @pytest.fixture
@@ -34,73 +43,133 @@ def gate():
 
 @pytest.fixture
 def worker(gate):
-    worker = LatestWorker(gate)
+    worker = Worker(gate)
     yield worker
     for _ in range(10):
         gate.go.release()
     assert worker.stop(TIMEOUT)
 
 
-def test_result_of_the_work(gate, worker):
-    future = worker.submit("a")
+def test_result_of_a_request(gate, worker):
+    future = worker.request("a")
     gate.go.release()
     assert future.result(TIMEOUT) == "did a"
     assert worker.dropped == 0
 
 
-def test_newest_waiting_item_wins_and_all_who_waited_get_its_result(gate, worker):
-    first = worker.submit("a")
-    assert gate.started.acquire(timeout=TIMEOUT)
-    waiting = [worker.submit(item) for item in "bcd"]
-    gate.go.release()
-    gate.go.release()
-    assert first.result(TIMEOUT) == "did a"
-    assert [future.result(TIMEOUT) for future in waiting] == ["did d"] * 3
-    assert gate.items == ["a", "d"]
+def test_of_what_is_offered_the_newest_waits(gate, worker):
+    worker.request("busy")
+    gate.wait_until_started()
+    for item in "abc":
+        worker.offer(item)
     assert worker.dropped == 2
+    gate.go.release()
+    gate.wait_until_started()
+    assert gate.items == ["busy", "c"]
+    gate.go.release()
 
 
-def test_the_same_item_again_is_not_a_drop(gate, worker):
-    worker.submit("a")
-    assert gate.started.acquire(timeout=TIMEOUT)
-    item = "b"
-    futures = [worker.submit(item), worker.submit(item)]
+def test_all_requests_are_served_in_order_and_before_what_is_offered(gate, worker):
+    first = worker.request("a")
+    gate.wait_until_started()
+    worker.offer("offered")
+    waiting = [worker.request(item) for item in "bcd"]
+    for _ in range(5):
+        gate.go.release()
+    assert first.result(TIMEOUT) == "did a"
+    assert [future.result(TIMEOUT) for future in waiting] == ["did b", "did c", "did d"]
+    for _ in range(4):
+        gate.wait_until_started()
+    assert gate.items == ["a", "b", "c", "d", "offered"]
+    assert worker.dropped == 0
+
+
+def test_a_request_interrupts_what_was_offered(gate, worker):
+    worker.offer("offered")
+    gate.wait_until_started()
+    future = worker.request("a")
+    gate.wait_until_started()
+    gate.go.release()
+    assert future.result(TIMEOUT) == "did a"
+    assert gate.items == ["offered", "a"]
+    assert worker.dropped == 1
+
+
+def test_a_request_does_not_interrupt_a_request(gate, worker):
+    first = worker.request("a")
+    gate.wait_until_started()
+    second = worker.request("b")
+    with pytest.raises(TimeoutError):
+        first.result(0.1)
     gate.go.release()
     gate.go.release()
-    assert [future.result(TIMEOUT) for future in futures] == ["did b"] * 2
+    assert (first.result(TIMEOUT), second.result(TIMEOUT)) == ("did a", "did b")
+
+
+@pytest.mark.parametrize("offered", [True, False])
+def test_who_asks_for_what_is_worked_on_shares_its_result(gate, worker, offered):
+    item = "a"
+    if offered:
+        worker.offer(item)
+    else:
+        worker.request(item)
+    gate.wait_until_started()
+    futures = [worker.request(item), worker.request(item)]
+    # It is a request now, which another does not interrupt.
+    other = worker.request("b")
+    gate.go.release()
+    assert [future.result(TIMEOUT) for future in futures] == ["did a"] * 2
+    gate.go.release()
+    assert other.result(TIMEOUT) == "did b"
+    assert gate.items == ["a", "b"]
+    assert worker.dropped == 0
+
+
+def test_who_asks_for_what_waits_shares_its_result(gate, worker):
+    worker.request("busy")
+    gate.wait_until_started()
+    item = "a"
+    worker.offer(item)
+    futures = [worker.request(item), worker.request(item)]
+    gate.go.release()
+    gate.go.release()
+    assert [future.result(TIMEOUT) for future in futures] == ["did a"] * 2
+    assert gate.items == ["busy", "a"]
     assert worker.dropped == 0
 
 
 def test_exception_goes_to_the_future_and_the_thread_lives_on():
-    worker = LatestWorker(lambda item: 1 / item)
+    worker = Worker(lambda item, interrupted: 1 / item)
     with pytest.raises(ZeroDivisionError):
-        worker.submit(0).result(TIMEOUT)
-    assert worker.submit(2).result(TIMEOUT) == 0.5
+        worker.request(0).result(TIMEOUT)
+    assert worker.request(2).result(TIMEOUT) == 0.5
     assert worker.stop(TIMEOUT)
 
 
 def test_stop_lets_the_running_work_end_and_cancels_what_waits(gate):
-    worker = LatestWorker(gate)
-    running = worker.submit("a")
-    assert gate.started.acquire(timeout=TIMEOUT)
-    waiting = worker.submit("b")
+    worker = Worker(gate)
+    running = worker.request("a")
+    gate.wait_until_started()
+    waiting = worker.request("b")
+    worker.offer("c")
     gate.go.release()
     assert worker.stop(TIMEOUT)
     assert running.result(0) == "did a"
     with pytest.raises(CancelledError):
         waiting.result(0)
     with pytest.raises(CancelledError):
-        worker.submit("c").result(0)
+        worker.request("d").result(0)
+    worker.offer("e")
     assert gate.items == ["a"]
 
 
 def test_stop_does_not_wait_for_ever(gate):
-    worker = LatestWorker(gate)
-    worker.submit("a")
-    assert gate.started.acquire(timeout=TIMEOUT)
+    worker = Worker(gate)
+    worker.request("a")
+    gate.wait_until_started()
     assert not worker.stop(0.05)
     gate.go.release()
 
 
 def test_stop_without_work():
-    assert LatestWorker(print).stop(TIMEOUT)
+    assert Worker(print).stop(TIMEOUT)

@@ -24,6 +24,7 @@ def main(args: list[str] | None = None) -> int:
     import rclpy
     from rclpy.exceptions import ParameterException
     from rclpy.executors import SingleThreadedExecutor
+    from rclpy.lifecycle import TransitionCallbackReturn
     from rclpy.signals import SignalHandlerOptions
 
     from gsfeatloc_ros.node.localizer_node import LocalizerNode
@@ -32,9 +33,13 @@ def main(args: list[str] | None = None) -> int:
     try:
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
         node = LocalizerNode()
-    except (ValueError, OSError, RuntimeError, ParameterException) as error:
+    except (ValueError, ParameterException) as error:
         rclpy.logging.get_logger("localizer").fatal(str(error))
         return 1
+    if node.autostart:
+        if node.trigger_configure() != TransitionCallbackReturn.SUCCESS:
+            return 1  # the reason is in the log
+        node.trigger_activate()
     stopping = threading.Event()
     _on_signal(lambda number, frame: stopping.set())
     executor = SingleThreadedExecutor()
@@ -42,12 +47,13 @@ def main(args: list[str] | None = None) -> int:
     while not stopping.is_set():
         executor.spin_once(timeout_sec=_SIGNAL_PERIOD)
 
-    if not node.stop(_STOP_TIMEOUT):
+    session = node.session
+    if session and not session.stop(_STOP_TIMEOUT):
         node.get_logger().warning("the running localization did not end in time")
         # The thread is in native code that the interpreter's own exit would pull away under it.
         sys.stderr.flush()
         os._exit(0)
-    if node.unanswered_requests:
+    if session and session.unanswered_requests:
         # A service cannot wait for acknowledgements: the answers get this long to be sent and to arrive.
         deadline = time.monotonic() + _ANSWER_TIME
         while time.monotonic() < deadline:

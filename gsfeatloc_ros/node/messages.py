@@ -9,7 +9,6 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from sensor_msgs.msg import Image
 from std_msgs.msg import Header
 
-from gsfeatloc_ros.estimate import Estimate
 from gsfeatloc_ros.geometry import quaternion_from_matrix
 
 
@@ -22,12 +21,12 @@ def image_message(rgb: np.ndarray, header: Header) -> Image:
     return Image(header=header, height=height, width=width, encoding="rgb8", step=3 * width, data=data)
 
 
-def pose_message(estimate: Estimate, header: Header) -> PoseWithCovarianceStamped:
-    """Pose message of an estimate that was localized."""
+def pose_message(pose: np.ndarray, covariance: np.ndarray, header: Header) -> PoseWithCovarianceStamped:
+    """Pose message of a pose (4, 4) and its covariance (6, 6) in ROS order, about the axes of the header's frame."""
     message = PoseWithCovarianceStamped(header=header)
     position, orientation = message.pose.pose.position, message.pose.pose.orientation
-    position.x, position.y, position.z = estimate.T_map_camera[:3, 3].tolist()
-    quaternion = quaternion_from_matrix(estimate.T_map_camera[:3, :3])
+    position.x, position.y, position.z = pose[:3, 3].tolist()
+    quaternion = quaternion_from_matrix(pose[:3, :3])
     orientation.x, orientation.y, orientation.z, orientation.w = quaternion.tolist()
-    message.pose.covariance = estimate.covariance.ravel().tolist()
+    message.pose.covariance = covariance.ravel().tolist()
     return message

@@ -1,27 +1,41 @@
-"""One thread that works on the newest item only."""
+"""One thread that works: on what is asked for first, and between that on the newest of what comes."""
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
-from threading import Condition, Thread
+from threading import Condition, Event, Thread
 from typing import Generic, TypeVar
+
+from gsfeatloc_ros.timing import Interrupted
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
-class LatestWorker(Generic[Item, Result]):
-    """Runs `work(item)` in one thread; an item still waiting gives way to a newer one.
+class _Task(Generic[Item, Result]):
+    def __init__(self, item: Item) -> None:
+        self.item = item
+        self.future: Future[Result] = Future()
+        self.interrupted = Event()
 
-    Whoever submitted an item that gave way gets the result for the newer one: a Future promises the result for the
-    newest item known when the work starts. An exception of `work` goes to the Future; the thread lives on.
+
+class Worker(Generic[Item, Result]):
+    """Runs `work(item, interrupted)` in one thread.
+
+    Items are offered, or requested. Of those offered only the newest waits, and it gives way to requests: if one comes
+    while an offered item is worked on, `interrupted()` turns true and `work` is to raise Interrupted. Requests are all
+    served, in the order in which they came. An exception of `work` goes to the Future; the thread lives on.
     """
 
-    def __init__(self, work: Callable[[Item], Result]) -> None:
+    def __init__(self, work: Callable[[Item, Callable[[], bool]], Result]) -> None:
         self._work = work
         self._changed = Condition()
-        self._waiting: tuple[Item, Future[Result]] | None = None
+        self._offered: _Task[Item, Result] | None = None
+        self._requested: deque[_Task[Item, Result]] = deque()
+        self._running: _Task[Item, Result] | None = None
+        self._running_was_requested = False
         self._stopping = False
         self._dropped = 0
         # A daemon: a call into native code that never returns must not keep the process alive.
@@ -30,45 +44,72 @@ class LatestWorker(Generic[Item, Result]):
 
     @property
     def dropped(self) -> int:
-        """Number of items that gave way to a newer one before they were worked on."""
+        """Number of offered items that gave way to a newer one or to a request."""
         return self._dropped
 
-    def submit(self, item: Item) -> Future[Result]:
-        """Work on `item` next; the Future is cancelled when the worker stops before that."""
+    def offer(self, item: Item) -> None:
+        """Work on `item` when nothing is requested, unless a newer one is offered by then."""
         with self._changed:
-            waiting_item, future = self._waiting or (item, Future())
-            if waiting_item is not item:
-                self._dropped += 1
             if not self._stopping:
-                self._waiting = (item, future)
+                self._dropped += self._offered is not None
+                self._offered = _Task(item)
                 self._changed.notify()
-        if self._stopping:
-            future.cancel()
-        return future
+
+    def request(self, item: Item) -> Future[Result]:
+        """Work on `item` in any case; whoever asks for the same one meanwhile shares the result.
+
+        The Future is cancelled when the worker stops before that.
+        """
+        with self._changed:
+            running = self._running
+            if running and running.item is item and not running.interrupted.is_set():
+                self._running_was_requested = True
+                return running.future
+            for waiting in self._requested:
+                if waiting.item is item:
+                    return waiting.future
+            if self._offered and self._offered.item is item:
+                self._offered = None
+            task = _Task(item)
+            if self._stopping:
+                task.future.cancel()
+                return task.future
+            self._requested.append(task)
+            if running and not self._running_was_requested:
+                running.interrupted.set()
+            self._changed.notify()
+        return task.future
 
     def stop(self, timeout: float) -> bool:
         """Cancel what waits, let the running work end for up to `timeout` seconds, and say whether it ended."""
         with self._changed:
             self._stopping = True
-            waiting, self._waiting = self._waiting, None
+            waiting, self._requested, self._offered = self._requested, deque(), None
             self._changed.notify()
-        if waiting:
-            waiting[1].cancel()
+        for task in waiting:
+            task.future.cancel()
         self._thread.join(timeout)
         return not self._thread.is_alive()
 
     def _run(self) -> None:
         while True:
             with self._changed:
-                self._changed.wait_for(lambda: self._waiting or self._stopping)
-                if self._waiting is None:
+                self._running = None
+                self._changed.wait_for(lambda: self._requested or self._offered or self._stopping)
+                if self._stopping:
                     return
-                (item, future), self._waiting = self._waiting, None
-            if not future.set_running_or_notify_cancel():
-                continue
+                self._running_was_requested = bool(self._requested)
+                if self._requested:
+                    task = self._requested.popleft()
+                else:
+                    task, self._offered = self._offered, None
+                self._running = task
             try:
-                result = self._work(item)
+                result = self._work(task.item, task.interrupted.is_set)
+            except Interrupted as error:
+                self._dropped += 1
+                task.future.set_exception(error)
             except Exception as error:
-                future.set_exception(error)
+                task.future.set_exception(error)
             else:
-                future.set_result(result)
+                task.future.set_result(result)

@@ -5,25 +5,15 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
-from gsfeatloc_ros.camera import Camera
 from gsfeatloc_ros.estimate import Estimate
+from gsfeatloc_ros.inputs import Inputs, PriorPolicy
 from gsfeatloc_ros.localize import Localizer
-from gsfeatloc_ros.messages import (
-    Prior,
-    decode_camera,
-    decode_compressed_image,
-    decode_image,
-    decode_pose,
-    decode_prior,
-    decode_prior_covariance,
-)
-from gsfeatloc_ros.replay.bag import COMPRESSED_IMAGE, Bag, Recorded
-
-T = TypeVar("T")
+from gsfeatloc_ros.messages import decode_pose, nanoseconds
+from gsfeatloc_ros.replay.bag import Bag, Recorded
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,12 +46,13 @@ class Replay:
     """Localizes every image of a bag with the camera_info and the prior that were recorded last before it.
 
     As in the node, a camera_info or prior that cannot be used takes the place of an older good one, and an image for
-    which one is missing is refused. Other than the node, which drops images while it is busy, it tries them all.
+    which one is missing is refused. Other than the node, which drops images while it is busy, it tries them all. It
+    knows no tf: priors are of the camera, in the map's frame.
 
     Args:
         bag: open.
         localizer: of the map.
-        map_frame: name of the map's frame, in which priors and the truth must be.
+        policy: what priors are worth; the truth must be in its map frame too.
         rectified: whether the images are; then the camera is that of camera_info's P.
 
     Attributes:
@@ -69,11 +60,15 @@ class Replay:
         unusable: how many messages, other than images, could not be used, by role and reason.
     """
 
-    def __init__(self, bag: Bag, localizer: Localizer, map_frame: str, rectified: bool = False) -> None:
-        self._bag, self._localizer, self._map_frame, self._rectified = bag, localizer, map_frame, rectified
-        # Or what is wrong with the newest.
-        self._camera: Camera | str = "no camera_info was recorded before this image"
-        self._prior: Prior | str = "no prior was recorded before this image"
+    def __init__(self, bag: Bag, localizer: Localizer, policy: PriorPolicy, rectified: bool = False) -> None:
+        self._bag, self._localizer = bag, localizer
+        self._inputs = Inputs(
+            policy,
+            _no_tf,
+            rectified,
+            "no camera_info was recorded before this image",
+            "no prior was recorded before this image",
+        )
         self.truth: list[tuple[int, np.ndarray]] = []
         self.unusable: Counter[tuple[str, str]] = Counter()
 
@@ -83,30 +78,29 @@ class Replay:
         Raises:
             BagError: the bag is damaged from here on.
         """
+        take = {
+            "camera_info": self._inputs.take_camera_info,
+            "prior": self._inputs.take_prior,
+            "truth": self._take_truth,
+        }
         for recorded in self._bag.messages():
             if recorded.role == "image":
                 yield self._attempt(recorded)
                 continue
             try:
-                self._take(recorded)
+                take[recorded.role](_content(recorded))
             except ValueError as error:
                 self.unusable[recorded.role, str(error)] += 1
-                if recorded.role == "camera_info":
-                    self._camera = str(error)
-                elif recorded.role == "prior":
-                    self._prior = str(error)
+                self._inputs.lose(recorded.role, str(error))
 
-    def _take(self, recorded: Recorded) -> None:
-        message = _content(recorded)
-        if recorded.role == "camera_info":
-            self._camera = decode_camera(message, self._rectified)
-        elif recorded.role == "prior":
-            self._prior = Prior(decode_prior(message, self._map_frame), decode_prior_covariance(message))
-        else:
-            self.truth.append((_nanoseconds(message), decode_pose(message, self._map_frame, "truth")))
+    def _take_truth(self, message: Any) -> None:
+        map_frame = self._inputs.policy.map_frame
+        if message.header.frame_id != map_frame:
+            raise ValueError(f"truth is in frame {message.header.frame_id!r} but the map is in {map_frame!r}")
+        self.truth.append((nanoseconds(message.header.stamp), decode_pose(message, "truth")))
 
     def _attempt(self, recorded: Recorded) -> Answer:
-        stamp = None if recorded.message is None else _nanoseconds(recorded.message)
+        stamp = None if recorded.message is None else nanoseconds(recorded.message.header.stamp)
         try:
             return self._localize(recorded, stamp)
         except Exception as error:  # as in the node: not foreseen, and the next image may well do
@@ -114,26 +108,14 @@ class Replay:
 
     def _localize(self, recorded: Recorded, stamp: int | None) -> Answer:
         try:
-            image, camera, prior = _pixels(recorded), _usable(self._camera), _usable(self._prior)
-            height, width = image.shape[:2]
-            if (camera.width, camera.height) != (width, height):
-                raise ValueError(
-                    f"camera_info is for {camera.width}x{camera.height} but the image is {width}x{height}: take the "
-                    "camera_info of this image"
-                )
+            query = self._inputs.query(_content(recorded))
         except ValueError as error:
             return Answer(recorded.bag_time, stamp, "refused", str(error))
-        estimate = self._localizer.localize(image, camera, prior.T_map_camera, prior.covariance)
+        prior = query.T_map_camera_prior
+        estimate = self._localizer.localize(query.image, query.camera, prior, query.prior_covariance)
         # The pictures of thousands of images would fill the memory.
         estimate = replace(estimate, correspondences=None, last_render=None)
-        return Answer(recorded.bag_time, stamp, estimate.status.value, estimate.reason, prior.T_map_camera, estimate)
-
-
-def _usable(value: T | str) -> T:
-    """The value, unless what is wrong with it took its place."""
-    if isinstance(value, str):
-        raise ValueError(value)
-    return value
+        return Answer(recorded.bag_time, stamp, estimate.status.value, estimate.reason, prior, estimate)
 
 
 def _content(recorded: Recorded) -> Any:
@@ -142,10 +124,5 @@ def _content(recorded: Recorded) -> Any:
     return recorded.message
 
 
-def _pixels(recorded: Recorded) -> np.ndarray:
-    message = _content(recorded)
-    return decode_compressed_image(message) if recorded.kind == COMPRESSED_IMAGE else decode_image(message)
-
-
-def _nanoseconds(message: Any) -> int:
-    return message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
+def _no_tf(target: str, source: str, stamp: int) -> np.ndarray:
+    raise ValueError("replay knows no tf: give priors of the camera in the map's frame, or its name (--map-frame)")

@@ -25,6 +25,7 @@ from tqdm import tqdm
 
 from gsfeatloc_ros.evaluate.extras import import_extra
 from gsfeatloc_ros.geometry import matrix_from_quaternion
+from gsfeatloc_ros.inputs import PriorPolicy
 from gsfeatloc_ros.localize import Localizer, LocalizerOptions
 from gsfeatloc_ros.maps import Similarity, read_dataparser_transforms
 from gsfeatloc_ros.match import DEFAULT_MATCHER, MATCHERS, create_matcher
@@ -65,8 +66,9 @@ def _replay(options: argparse.Namespace) -> int:
     if options.truth:
         topics["truth"] = options.truth
         import_extra("matplotlib")  # to say now, not after an hour, that it is missing
+    policy = PriorPolicy(map_frame=options.map_frame, max_age=options.prior_max_age)
     with open_bag(options.bag, topics) as bag:
-        replay = Replay(bag, _localizer(options), options.map_frame, options.rectified)
+        replay = Replay(bag, _localizer(options), policy, options.rectified)
         options.out.mkdir(parents=True, exist_ok=True)
         start = time.monotonic()
         answers, status = _collect(replay, bag.images)
@@ -164,6 +166,13 @@ def _parser() -> argparse.ArgumentParser:
         "--truth",
         metavar="TOPIC",
         help="the true pose of the camera: as --prior, or a nav_msgs/Odometry of the camera in the map frame",
+    )
+    parser.add_argument(
+        "--prior-max-age",
+        type=number(float, 0),
+        default=PriorPolicy.max_age,
+        metavar="SECONDS",
+        help="by which a prior may be older or newer than an image; 0 for no limit (default: %(default)s)",
     )
     parser.add_argument("--rectified", action="store_true", help="the images are rectified, as image.rectified")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new or empty folder")

@@ -1,0 +1,55 @@
+"""Quality of service of the node's topics: parameters may override it, and what does not fit is told."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy, qos_policy_name_from_kind
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.subscription import Subscription
+
+# Only the newest image counts, and cameras publish with best effort.
+NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+RELIABLE = QoSProfile(depth=10)
+# A pose is kept for those who subscribe later.
+LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+# All of it counts, and much may come while a map is loaded.
+ODOMETRY = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+
+def overridable() -> QoSOverridingOptions:
+    """Let parameters such as qos_overrides./image.subscription.reliability say what the node asks for."""
+    return QoSOverridingOptions(
+        (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY, QoSPolicyKind.DURABILITY)
+    )
+
+
+def subscribe(
+    node: Node,
+    message_type: type,
+    topic: str,
+    callback: Callable[[Any], None],
+    qos: QoSProfile,
+    complain: Callable[[str], None],
+) -> Subscription:
+    """Subscribe with a QoS that can be overridden; `complain` is told of a publisher whose own does not fit."""
+    name = node.resolve_topic_name(topic)
+
+    def incompatible(event: Any) -> None:
+        policy = qos_policy_name_from_kind(event.last_policy_kind).lower()
+        complain(
+            f"a publisher on {name} offers another {policy} than is asked for, nothing comes from it: set "
+            f"qos_overrides.{name}.subscription.{policy} to what it offers (ros2 topic info --verbose {name})"
+        )
+
+    return node.create_subscription(
+        message_type,
+        topic,
+        callback,
+        qos,
+        event_callbacks=SubscriptionEventCallbacks(incompatible_qos=incompatible),
+        qos_overriding_options=overridable(),
+    )

@@ -1,0 +1,152 @@
+"""When the installed localizer works, and what can be changed while it runs."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from node_harness import (
+    TIMEOUT,
+    assert_close,
+    connected_client,
+    info_of,
+    prior_of,
+    rgb_image,
+    running_localizer,
+    text,
+)
+from rcl_interfaces.srv import DescribeParameters
+from sensor_msgs.msg import Image
+from std_msgs.msg import Header
+
+
+@pytest.fixture(scope="module")
+def localizer(room_map_file):
+    with running_localizer(map__path=room_map_file) as process:
+        yield process
+
+
+@pytest.fixture
+def client(localizer, room_camera):
+    with connected_client() as client:
+        client.send_camera_info(info_of(room_camera))
+        yield client
+        for name, value in {"mode": "continuous", "max_rate": 0.0}.items():
+            assert client.set_parameter(name, value).successful
+
+
+@pytest.fixture
+def query(room_queries):
+    return room_queries[0]
+
+
+def test_on_request_only_services_localize(client, query):
+    client.send_prior(prior_of(query.T_map_camera_prior))
+    assert client.set_parameter("mode", "on_request").successful
+    image = client.send_once(query.image)
+    assert not client.is_tried(image)
+    answer = client.relocalize()
+    assert answer.success, answer.message
+    assert_close(client.pose_of(image), query.T_map_camera)
+
+
+def test_on_prior_one_image_for_each(client, query):
+    assert client.set_parameter("mode", "on_prior").successful
+    client.send_prior(prior_of(query.T_map_camera_prior))
+    for _ in range(2):
+        image = client.send_once(query.image)
+        assert client.is_tried(image, TIMEOUT)
+        assert_close(client.pose_of(image), query.T_map_camera)
+        assert not client.is_tried(client.send_once(query.image), 1.0)
+        client.send_prior(prior_of(query.T_map_camera_prior))
+
+
+def test_no_more_images_a_second_than_allowed(client, query):
+    client.send_prior(prior_of(query.T_map_camera_prior))
+    assert client.set_parameter("max_rate", 0.25).successful
+    # Stamps are a second apart: of eight images two are tried.
+    images = []
+    for _ in range(8):
+        images.append(client.send_once(query.image))
+        client.spin(1.0)
+    assert [client.is_tried(image, 1.0) for image in images].count(True) == 2
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "says"),
+    [
+        ("mode", "always", "'always' is not one of continuous, on_prior, on_request"),
+        ("max_rate", -1.0, "range"),
+        ("max_rate", "fast", "type"),
+        ("localizer.min_inliers", 3, "range"),
+        ("matcher.name", "xfeat", "read-only"),
+        ("map.path", "/nowhere/room.ply", "there is no '/nowhere/room.ply'"),
+    ],
+)
+def test_parameters_that_cannot_be_set_stay_as_they_are(client, name, value, says):
+    before = client.parameter(name)
+    result = client.set_parameter(name, value)
+    assert not result.successful
+    assert says in result.reason
+    assert client.parameter(name) == before
+
+
+def test_options_of_the_localizer_change_while_it_runs(client, query):
+    client.send_prior(prior_of(query.T_map_camera_prior))
+    assert client.set_parameter("localizer.min_inliers", 5000).successful
+    refused = client.attempt(rgb_image(query.image))
+    assert refused.values["status"] == "rejected"
+    assert "at least 5000 needed" in refused.reason
+    assert client.set_parameter("localizer.min_inliers", 20).successful
+    assert client.attempt(rgb_image(query.image)).ok
+
+
+def test_descriptions_say_which_parameters_can_be_set(client):
+    request = DescribeParameters.Request(names=["mode", "matcher.name"])
+    mode, matcher = client.call(DescribeParameters, "localizer/describe_parameters", request).descriptors
+    assert not mode.read_only
+    assert matcher.read_only
+    assert mode.additional_constraints == "One of continuous, on_prior, on_request."
+
+
+def test_health_says_how_it_goes(client, room_map_file, query):
+    client.send_prior(prior_of(query.T_map_camera_prior))
+    assert client.attempt(rgb_image(query.image)).ok
+    seen = len(client.health)
+    assert client.spin_until(lambda: len(client.health) > seen)
+    values = client.health[-1].values
+    assert values["map"] == str(room_map_file)
+    assert (values["mode"], values["device"]) == ("continuous", "cpu")
+    assert float(values["image_rate"]) > 0
+    assert float(values["answer_rate"]) > 0
+    assert 0 < float(values["acceptance"]) <= 1
+    assert float(values["ms_total"]) > 0
+    assert float(values["answer_age"]) > 0
+    assert "inliers of" in values["last_reason"]
+
+
+def test_debug_image_shows_photo_and_render_and_is_drawn_for_refused_ones_too(client, room_camera, query):
+    pictures = client.listen(Image, "debug_image")
+    client.send_prior(prior_of(query.T_map_camera_prior))
+    for info in (info_of(room_camera), info_of(room_camera.scaled(320, 240))):
+        client.send_camera_info(info)
+        image = rgb_image(query.image)
+        client.attempt(image)
+        assert client.spin_until(lambda image=image: any(text(picture) == text(image) for picture in pictures))
+        picture = pictures[-1]
+        pixels = np.frombuffer(picture.data, np.uint8).reshape(picture.height, picture.width, 3)
+        assert picture.width == 1280
+        assert pixels[:480, :640].std() > 10
+        assert (pixels[:480, 640:].std() > 20) == (info.width == 640)
+
+
+def test_initialpose_needs_tf(client, query):
+    message = PoseWithCovarianceStamped(header=Header(frame_id="map"))
+    message.pose.pose = prior_of(query.T_map_camera_prior).pose
+    client.publish("initialpose", message)
+    refused = client.attempt(rgb_image(query.image))
+    assert refused.values["status"] == "refused"
+    assert "tf" in refused.reason
+    assert not client.relocalize().success
+    client.send_prior(prior_of(query.T_map_camera_prior))
+    assert client.attempt(rgb_image(query.image)).ok
