@@ -29,11 +29,12 @@ class _Encoding:
     """How the pixels of an image encoding lie in memory.
 
     Attributes:
-        channels: samples per pixel as stored (YUV 4:2:2 stores two).
+        channels: samples per pixel as stored (YUV 4:2:2 stores two), in a row.
         bits: 8 or 16 bits per sample.
         conversion: cv2.cvtColor code that makes it RGB; None where it is RGB.
         multiple: width and height must be multiples of these.
         smallest: least width and height that can be converted.
+        planes: rows of data for two rows of pixels; more than two where the chroma lies below the brightness.
     """
 
     channels: int
@@ -41,6 +42,7 @@ class _Encoding:
     conversion: int | None
     multiple: tuple[int, int] = (1, 1)
     smallest: tuple[int, int] = (1, 1)
+    planes: int = 2
 
 
 def _bayer(bits: int, conversion: int) -> _Encoding:
@@ -52,13 +54,20 @@ def _yuv422(conversion: int) -> _Encoding:
     return _Encoding(2, 8, conversion, multiple=(2, 1), smallest=(2, 1))
 
 
-# The names of sensor_msgs/image_encodings.hpp. Of OpenCV's names for Bayer patterns only the four-letter ones mean the
-# same as in ROS.
+# The names of sensor_msgs/image_encodings.hpp that are of pictures; those like 8UC3 are in OpenCV's order. Of OpenCV's
+# own names for Bayer patterns only the four-letter ones mean the same as in ROS.
 ENCODINGS = {
     "rgb8": _Encoding(3, 8, None),
     "bgr8": _Encoding(3, 8, cv2.COLOR_BGR2RGB),
     "rgba8": _Encoding(4, 8, cv2.COLOR_RGBA2RGB),
     "bgra8": _Encoding(4, 8, cv2.COLOR_BGRA2RGB),
+    "rgb16": _Encoding(3, 16, None),
+    "bgr16": _Encoding(3, 16, cv2.COLOR_BGR2RGB),
+    "rgba16": _Encoding(4, 16, cv2.COLOR_RGBA2RGB),
+    "bgra16": _Encoding(4, 16, cv2.COLOR_BGRA2RGB),
+    "8UC1": _Encoding(1, 8, cv2.COLOR_GRAY2RGB),
+    "8UC3": _Encoding(3, 8, cv2.COLOR_BGR2RGB),
+    "8UC4": _Encoding(4, 8, cv2.COLOR_BGRA2RGB),
     "mono8": _Encoding(1, 8, cv2.COLOR_GRAY2RGB),
     "mono16": _Encoding(1, 16, cv2.COLOR_GRAY2RGB),
     "bayer_rggb8": _bayer(8, cv2.COLOR_BayerRGGB2RGB),
@@ -73,6 +82,8 @@ ENCODINGS = {
     "uyvy": _yuv422(cv2.COLOR_YUV2RGB_UYVY),
     "yuv422_yuy2": _yuv422(cv2.COLOR_YUV2RGB_YUY2),
     "yuyv": _yuv422(cv2.COLOR_YUV2RGB_YUY2),
+    "nv21": _Encoding(1, 8, cv2.COLOR_YUV2RGB_NV21, multiple=(2, 2), smallest=(2, 2), planes=3),
+    "nv24": _Encoding(1, 8, cv2.COLOR_YUV2RGB_NV12, multiple=(2, 2), smallest=(2, 2), planes=6),
 }
 
 
@@ -91,17 +102,22 @@ def validate_image(message: Image) -> None:
     if width < encoding.smallest[0] or height < encoding.smallest[1]:
         raise ValueError(f"image size {width}x{height} is too small for {message.encoding}")
     if width % encoding.multiple[0] or height % encoding.multiple[1]:
-        raise ValueError(f"image width {width} must be even for {message.encoding}: check the camera driver")
+        raise ValueError(
+            f"image size {width}x{height} must be a multiple of {encoding.multiple[0]}x{encoding.multiple[1]} "
+            f"for {message.encoding}: check the camera driver"
+        )
     row_bytes = width * encoding.channels * encoding.bits // 8
     if message.step < row_bytes:
         raise ValueError(
             f"image step {message.step} is less than the {row_bytes} bytes of a row of {width} {message.encoding} "
             "pixels: check the camera driver"
         )
-    if len(message.data) < message.step * height:
+    needed = message.step * height * encoding.planes // 2
+    if len(message.data) < needed:
         raise ValueError(
             f"image data has {len(message.data)} bytes but step {message.step} x height {height} needs "
-            f"{message.step * height}: the image was cut short, check the camera driver"
+            f"{needed}{'' if encoding.planes == 2 else ' with the chroma'}: the image was cut short, check the camera "
+            "driver"
         )
 
 
@@ -115,9 +131,15 @@ def decode_image(message: Image) -> np.ndarray:
     """
     validate_image(message)
     encoding = ENCODINGS[message.encoding]
-    rows = np.frombuffer(message.data, np.uint8, count=message.step * message.height)
-    rows = rows.reshape(message.height, message.step)[:, : message.width * encoding.channels * encoding.bits // 8]
+    height = message.height * encoding.planes // 2
+    rows = np.frombuffer(message.data, np.uint8, count=message.step * height)
+    rows = rows.reshape(height, message.step)[:, : message.width * encoding.channels * encoding.bits // 8]
     pixels = np.ascontiguousarray(rows)
+    if message.encoding == "nv24":
+        # A chroma of each pixel, in rows of twice the width: OpenCV takes one of four (NV12).
+        brightness, chroma = np.split(pixels, [message.height])
+        chroma = chroma.reshape(message.height, message.width, 2)[::2, ::2]
+        pixels = np.vstack([brightness, chroma.reshape(-1, message.width)])
     if encoding.bits == 16:
         samples = pixels.view(">u2" if message.is_bigendian else "<u2").astype(np.uint16)
         pixels = cv2.convertScaleAbs(samples, alpha=255.0 / 65535.0)

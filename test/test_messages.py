@@ -21,10 +21,12 @@ from gsfeatloc_ros.node.messages import image_message, pose_message
 settings.register_profile("unhurried", deadline=None)
 settings.load_profile("unhurried")
 
-COLOUR_ORDER = {"rgb8": "rgb", "bgr8": "bgr", "rgba8": "rgba", "bgra8": "bgra"}
+COLOUR_ORDER = {"rgb8": "rgb", "bgr8": "bgr", "rgba8": "rgba", "bgra8": "bgra", "8UC3": "bgr", "8UC4": "bgra"}
+DEEP_COLOUR_ORDER = {"rgb16": "rgb", "bgr16": "bgr", "rgba16": "rgba", "bgra16": "bgra"}
+PLANAR_ORDER = {"nv21": "vu", "nv24": "uv"}
 YUV_ORDER = {"yuv422": "uyvy", "uyvy": "uyvy", "yuv422_yuy2": "yuyv", "yuyv": "yuyv"}
 BAYER = sorted(name for name in ENCODINGS if name.startswith("bayer"))
-MONO = ("mono8", "mono16")
+MONO = ("mono8", "mono16", "8UC1")
 any_double = st.floats(allow_nan=True, allow_infinity=True)
 
 
@@ -62,10 +64,53 @@ def test_colour_is_put_in_the_order_rgb(case):
         assert np.array_equal(rgb[..., channel], pixels[..., order.index(colour)])
 
 
+@given(images(DEEP_COLOUR_ORDER))
+def test_colour_of_16_bits_becomes_8(case):
+    message, samples = case
+    order = DEEP_COLOUR_ORDER[message.encoding]
+    pixels = samples.reshape(message.height, message.width, len(order))
+    rgb = decode_image(message)
+    for channel, colour in enumerate("rgb"):
+        expected = [[round(int(v) / 257) for v in row] for row in pixels[..., order.index(colour)]]
+        assert np.array_equal(rgb[..., channel], expected)
+
+
+@given(
+    encoding=st.sampled_from(sorted(PLANAR_ORDER)),
+    size=st.tuples(st.integers(1, 4), st.integers(1, 4)),
+    padding=st.integers(0, 5),
+    data=st.data(),
+)
+def test_chroma_that_lies_below_the_brightness_follows_bt601(encoding, size, padding, data):
+    height, width = 2 * size[0], 2 * size[1]
+    luma = data.draw(npst.arrays(np.uint8, (height, width), elements=st.integers(16, 255)))
+    # One pair of chroma values for each four pixels; nv24 has them for each pixel.
+    pairs = data.draw(npst.arrays(np.uint8, (height // 2, width // 2, 2)))
+    chroma = pairs if encoding == "nv21" else pairs.repeat(2, 0).repeat(2, 1)
+    message = make_image(encoding, np.vstack([luma, chroma.reshape(-1, width)]), padding, bigendian=False)
+    message.width, message.height = width, height
+    rgb = decode_image(message)
+    for row in range(height):
+        for column in range(width):
+            value = dict(zip(PLANAR_ORDER[encoding], pairs[row // 2, column // 2].astype(float) - 128, strict=True))
+            y, u, v = 1.164 * (float(luma[row, column]) - 16), value["u"], value["v"]
+            expected = np.clip([y + 1.596 * v, y - 0.813 * v - 0.391 * u, y + 2.018 * u], 0, 255)
+            assert np.allclose(rgb[row, column], expected, atol=2)
+    message.data = message.data[:-1]
+    with pytest.raises(ValueError, match="with the chroma"):
+        decode_image(message)
+
+
+def test_every_encoding_that_is_of_a_picture_is_known():
+    # sensor_msgs/image_encodings.hpp of Jazzy, but for depth, flow and the like: 16UC1, 32FC1, 8UC2 ...
+    assert set(ENCODINGS) == {*COLOUR_ORDER, *DEEP_COLOUR_ORDER, *MONO, *YUV_ORDER, *PLANAR_ORDER, *BAYER}
+    assert len(BAYER) == 8
+
+
 @given(images(MONO))
 def test_grey_fills_all_channels_and_16_bits_become_8(case):
     message, samples = case
-    grey = samples if message.encoding == "mono8" else [[round(int(v) / 257) for v in row] for row in samples]
+    grey = samples if message.encoding != "mono16" else [[round(int(v) / 257) for v in row] for row in samples]
     rgb = decode_image(message)
     for channel in range(3):
         assert np.array_equal(rgb[..., channel], grey)
@@ -135,7 +180,7 @@ def test_data_longer_than_the_image_is_taken():
         ({"step": 11}, "step 11 is less than the 12 bytes"),
         ({"data": bytes(47)}, "data has 47 bytes"),
         ({"data": b""}, "data has 0 bytes"),
-        ({"encoding": "yuyv", "width": 3}, "width 3 must be even"),
+        ({"encoding": "yuyv", "width": 3}, "size 3x[0-9]+ must be a multiple of 2x1"),
         ({"encoding": "bayer_rggb8", "width": 2}, "too small"),
     ],
 )
