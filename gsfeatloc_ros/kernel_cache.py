@@ -2,28 +2,45 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import tempfile
 from pathlib import Path
 
-_BESIDE_SOURCES = Path(__file__).parent / "render" / "__pycache__"
+_PACKAGE = Path(__file__).parent
+_BESIDE_SOURCES = _PACKAGE / "render" / "__pycache__"
 
 
 def set_kernel_cache() -> None:
-    """Let numba keep compiled kernels in a user's cache folder where it cannot do so beside their sources.
+    """Let numba keep compiled kernels where it can write, in a folder of their own for each state of their sources.
 
-    That is $XDG_CACHE_HOME/gsfeatloc_ros/numba or ~/.cache/gsfeatloc_ros/numba. A NUMBA_CACHE_DIR that is set stays.
+    numba looks whether the file that a kernel stands in has changed, not whether what it imports has. The folder is
+    below NUMBA_CACHE_DIR where that is set; otherwise beside the sources, or where that cannot be written to, below
+    $XDG_CACHE_HOME/gsfeatloc_ros/numba or ~/.cache/gsfeatloc_ros/numba.
     """
-    if os.environ.get("NUMBA_CACHE_DIR") or can_write(_BESIDE_SOURCES):
-        return
-    folder = user_cache_folder() / "numba"
+    name = f"kernels-{hash_of_sources('render')[:16]}"
+    root = os.environ.get("NUMBA_CACHE_DIR") or next(
+        (folder for folder in (_BESIDE_SOURCES, user_cache_folder() / "numba") if can_write(folder)), None
+    )
     # Without any place numba refuses to load the kernels; this one lasts for the process and those it starts.
-    os.environ["NUMBA_CACHE_DIR"] = str(folder) if can_write(folder) else tempfile.mkdtemp(prefix="gsfeatloc_ros-")
+    root = Path(root or tempfile.mkdtemp(prefix="gsfeatloc_ros-"))
+    # Processes inherit it from those that start them.
+    if root.name != name:
+        os.environ["NUMBA_CACHE_DIR"] = str(root / name)
 
 
 def kernel_cache_folder() -> Path:
     """Where numba keeps compiled kernels, once set_kernel_cache was called."""
-    return Path(os.environ.get("NUMBA_CACHE_DIR") or _BESIDE_SOURCES)
+    return Path(os.environ["NUMBA_CACHE_DIR"])
+
+
+def hash_of_sources(*folders: str) -> str:
+    """SHA-256 of the sources in some of the package's folders: the version of what they make and keep in files."""
+    digest = hashlib.sha256()
+    for folder in folders:
+        for source in sorted((_PACKAGE / folder).glob("*.py")):
+            digest.update(source.read_bytes())
+    return digest.hexdigest()
 
 
 def user_cache_folder() -> Path:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import tracemalloc
 from dataclasses import replace
 from functools import partial
 
@@ -14,9 +15,10 @@ from hypothesis import strategies as st
 
 from gsfeatloc_ros import render as renderers
 from gsfeatloc_ros.camera import Camera
-from gsfeatloc_ros.geometry import make_pose, so3_exp
+from gsfeatloc_ros.geometry import make_pose, so3_exp, transform
 from gsfeatloc_ros.maps import GaussianMap, load_map
 from gsfeatloc_ros.maps.gaussian_map import SH_COEFFICIENTS
+from gsfeatloc_ros.maps.ply import write_ply
 from gsfeatloc_ros.render import Render
 from gsfeatloc_ros.render import lanes as simd
 from gsfeatloc_ros.render.base import DEPTH_MIN_ALPHA, MIN_ALPHA
@@ -186,6 +188,25 @@ def test_extreme_shapes_are_drawn_as_the_reference_draws_them(scales) -> None:
     assert_same(fast, ReferenceRenderer(gaussian_map).render(camera, np.eye(4)), 60)
 
 
+def needles(seed: int, count: int) -> GaussianMap:
+    """Gaussians of up to thousands of pixels, many of them thinner than one, in all directions."""
+    rng = np.random.default_rng(seed)
+    gaussian_map = random_map(count, 0, seed)
+    scales = np.exp(rng.uniform([-2, -12, -12], [5, 0, 0], (count, 3)))
+    means = rng.uniform([-3, -3, 0.02], [3, 3, 4], (count, 3))
+    return replace(gaussian_map, means=means.astype(np.float32), scales=scales.astype(np.float32))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_needles_are_nearly_drawn_as_the_reference_draws_them(seed: int) -> None:
+    gaussian_map, camera = needles(seed, 100), Camera(320, 240, np.array([[250.0, 0, 160], [0, 250, 120], [0, 0, 1]]))
+    fast = create_renderer(gaussian_map).render(camera, np.eye(4))
+    assert psnr(fast, ReferenceRenderer(gaussian_map).render(camera, np.eye(4))) > 40
+    # Among many, some are so long and thin that float32 has nothing left of their width.
+    crowd = create_renderer(needles(seed, 20_000)).render(camera, np.eye(4))
+    assert ((crowd.rgb >= 0) & (crowd.rgb <= 1)).all()
+
+
 def test_maps_far_from_their_origin_render_alike() -> None:
     near = random_map(300, 0, seed=5)
     # What float32 can represent so far away, so that only the renderer's own arithmetic is tested.
@@ -196,6 +217,32 @@ def test_maps_far_from_their_origin_render_alike() -> None:
     pose = make_pose(np.eye(3), np.array([offset, 0, 0], dtype=np.float64))
     far_away = create_renderer(replace(near, means=means + np.float32([offset, 0, 0]))).render(camera, pose)
     assert psnr(at_origin, far_away) > 80
+
+
+def test_splats_are_drawn_in_order_however_close_they_are() -> None:
+    """Pairs of red and green, apart by about as much as float32 can say: calculated in it, many fall the wrong way."""
+    rng = np.random.default_rng(3)
+    camera = Camera(320, 320, np.array([[300.0, 0, 159.5], [0, 300.0, 159.5], [0, 0, 1]]))
+    pixels = np.stack(np.meshgrid(*[np.arange(8, 320, 16)] * 2), axis=-1).reshape(-1, 2)
+    pose = make_pose(so3_exp(rng.normal(size=3)), rng.uniform(-5, 5, 3))
+    red = transform(pose, camera.rays(pixels.astype(float)) * rng.uniform(3, 4, (len(pixels), 1))).astype(np.float32)
+    green = red + rng.uniform(-5e-7, 5e-7, red.shape).astype(np.float32)
+    ones = np.ones(2 * len(red), np.float32)
+    colours = np.repeat([[1.0, 0, 0], [0, 1.0, 0]], len(red), axis=0)
+    gaussian_map = GaussianMap(
+        means=np.concatenate([red, green]),
+        scales=0.01 * ones[:, None] * np.ones(3, np.float32),
+        rotations=ones[:, None] * np.float32([1, 0, 0, 0]),
+        opacities=0.8 * ones,
+        sh=((colours - 0.5) / SH_C0).astype(np.float32)[:, None],
+    )
+    red_depth, green_depth = (
+        ((points.astype(np.float64) - pose[:3, 3]) @ pose[:3, 2]).astype(np.float32) for points in (red, green)
+    )
+    drawn = create_renderer(gaussian_map).render(camera, pose).rgb[pixels[:, 1], pixels[:, 0]]
+    told_apart = red_depth != green_depth
+    assert told_apart.sum() > 100
+    np.testing.assert_array_equal((drawn[:, 0] > drawn[:, 1])[told_apart], (red_depth < green_depth)[told_apart])
 
 
 def test_crowded_tiles_make_the_buffers_grow() -> None:
@@ -393,6 +440,20 @@ def test_prepared_maps_take_little_memory() -> None:
     prepared = prepare(gaussian_map)
     parameters = 4 * (3 + 3 + 4 + 1 + 48) * len(gaussian_map)
     assert sum(a.nbytes for a in (prepared.gaussians, prepared.sh, prepared.low, prepared.high)) < 0.6 * parameters
+
+
+def test_loading_takes_little_more_than_the_map_and_what_is_prepared_from_it(tmp_path) -> None:
+    path = tmp_path / "map.ply"
+    write_ply(path, random_map(400 * CHUNK, 3, seed=0))
+    prepare(load_map(path))  # what compiled kernels take does not count
+    tracemalloc.start()
+    try:
+        prepare(load_map(path))
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    parameters = 4 * (3 + 3 + 4 + 1 + 48) * 400 * CHUNK
+    assert 1.5 * parameters < peak <= 1.6 * parameters
 
 
 def test_a_prepared_map_renders_as_the_map_itself(shared) -> None:

@@ -47,25 +47,38 @@ def cache_dir(root: Path, **variables: str) -> str:
 
 
 def test_kernels_stay_beside_their_sources_where_they_can(unwritable_install):
-    (unwritable_install / "gsfeatloc_ros" / "render" / "__pycache__").unlink()
-    assert cache_dir(unwritable_install) == "None"
+    beside = unwritable_install / "gsfeatloc_ros" / "render" / "__pycache__"
+    beside.unlink()
+    assert Path(cache_dir(unwritable_install)).parent == beside
 
 
 def test_unwritable_install_keeps_kernels_in_the_users_cache(unwritable_install, tmp_path):
     where = cache_dir(unwritable_install, HOME=str(tmp_path / "home"))
-    assert where == str(tmp_path / "home" / ".cache" / "gsfeatloc_ros" / "numba")
+    assert Path(where).parent == tmp_path / "home" / ".cache" / "gsfeatloc_ros" / "numba"
     where = cache_dir(unwritable_install, XDG_CACHE_HOME=str(tmp_path / "xdg"))
-    assert where == str(tmp_path / "xdg" / "gsfeatloc_ros" / "numba")
+    assert Path(where).parent == tmp_path / "xdg" / "gsfeatloc_ros" / "numba"
 
 
-def test_what_the_user_set_stays(unwritable_install, tmp_path):
-    assert cache_dir(unwritable_install, NUMBA_CACHE_DIR=str(tmp_path / "mine")) == str(tmp_path / "mine")
+def test_kernels_are_kept_below_what_the_user_set_and_once_only(unwritable_install, tmp_path):
+    where = cache_dir(unwritable_install, NUMBA_CACHE_DIR=str(tmp_path / "mine"))
+    assert Path(where).parent == tmp_path / "mine"
+    # As a process that this one starts has it.
+    assert cache_dir(unwritable_install, NUMBA_CACHE_DIR=where) == where
+
+
+@pytest.mark.parametrize("source", ["base.py", "lanes.py", "blend.py"])
+def test_kernels_of_other_sources_are_kept_apart(unwritable_install, tmp_path, source):
+    where = {"NUMBA_CACHE_DIR": str(tmp_path)}
+    before = cache_dir(unwritable_install, **where)
+    with (unwritable_install / "gsfeatloc_ros" / "render" / source).open("a") as file:
+        file.write("# changed\n")
+    assert cache_dir(unwritable_install, **where) != before
 
 
 def test_without_any_writable_home_kernels_are_kept_for_the_process(unwritable_install, tmp_path):
     (tmp_path / "home").touch()
     where = Path(cache_dir(unwritable_install, HOME=str(tmp_path / "home"), TMPDIR=str(tmp_path)))
-    assert where.parent == tmp_path
+    assert where.parent.parent == tmp_path
     assert can_write(where)
 
 

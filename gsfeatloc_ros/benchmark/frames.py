@@ -27,7 +27,7 @@ _FIELD_OF_VIEW = 65.0  # degrees, horizontal
 # A view of a whole map has this share of the Gaussians on each side of what it looks at.
 _OUTSIDE = 0.05
 # The first frames grow the renderer's buffers.
-_UNCOUNTED = 2
+UNCOUNTED = 2
 # The CPU renderer's steps by the functions that do them.
 _STAGES = {"visible_chunks": "cull", "project": "project", "gather": "scatter", "blend": "sort and blend"}
 
@@ -97,7 +97,7 @@ def measure_scene(path: Path, size: Size, device: str, threads: int) -> dict[str
 
 def measure_frames(renderer: Renderer, camera: Camera, poses: list[np.ndarray]) -> dict[str, Any]:
     """Milliseconds of frames at `poses`, (4, 4) each, also by stage (mean), and how much of the last one is covered."""
-    for pose in poses[:_UNCOUNTED]:
+    for pose in poses[:UNCOUNTED]:
         renderer.render(camera, pose)
     frames = [timed(renderer.render, camera, pose) for pose in poses]
     # Apart from the others, whose time this is not to cost.

@@ -13,7 +13,7 @@ from gsfeatloc_ros.maps.gaussian_map import GaussianMap, MapError
 # Constant harmonic of the sphere: colour = 0.5 + SH_C0 * its coefficient.
 SH_C0 = 0.28209479177387814
 # Gaussians taken apart at once: a block of them stays in the CPU's cache. A multiple of compressed .ply's chunk.
-BLOCK = 8192
+BLOCK = 4096
 # Of SH degree 3 these take 11.8 GB.
 MAX_GAUSSIANS = 50_000_000
 # An .spz of SH degree 3 takes no more for each.

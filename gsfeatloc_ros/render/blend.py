@@ -26,14 +26,14 @@ from gsfeatloc_ros.render.lanes import (
 )
 from gsfeatloc_ros.render.project import (
     BLUE,
-    CONIC_XX,
-    CONIC_XY,
-    CONIC_YY,
+    CONIC_X,
+    CONIC_Y,
     DEPTH,
     GREEN,
     LEFT,
     LOG_OPACITY,
     RED,
+    SLANT,
     SPLAT_SIZE,
     TILE,
     X,
@@ -248,9 +248,8 @@ def _blend_block(batch, members, x0, y0, nearest, state, at):
         k = _U(lowest_bit(members)) * _U(SPLAT_SIZE)
         members &= members - _U(1)
         dx, dy = columns - batch[k + _U(X)], rows - batch[k + _U(Y)]
-        log_alpha = dx * (dx * batch[k + _U(CONIC_XX)] + dy * batch[k + _U(CONIC_XY)]) + (
-            dy * dy * batch[k + _U(CONIC_YY)] + batch[k + _U(LOG_OPACITY)]
-        )
+        dx = dx - dy * batch[k + _U(SLANT)]
+        log_alpha = dx * dx * batch[k + _U(CONIC_X)] + (dy * dy * batch[k + _U(CONIC_Y)] + batch[k + _U(LOG_OPACITY)])
         alpha = select(log_alpha >= _LOG_MIN_ALPHA, minimum(exp2(log_alpha), _MAX_ALPHA), _ZERO)
         after = transmittance * (_ONE - alpha)
         # It only falls: a ray that has ended remains so.

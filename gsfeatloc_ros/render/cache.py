@@ -16,7 +16,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-import gsfeatloc_ros
+from gsfeatloc_ros.kernel_cache import hash_of_sources
 from gsfeatloc_ros.maps import Similarity, load_map
 from gsfeatloc_ros.render.prepare import PreparedMap, prepare
 
@@ -154,10 +154,5 @@ def _identity(file: Path) -> list[Any]:
 
 @functools.cache
 def _code() -> str:
-    """Hash of the sources that decide what a prepared map is: the version of the cache."""
-    package = Path(gsfeatloc_ros.__file__).parent
-    digest = hashlib.sha256()
-    preparing = (package / "render" / name for name in ("base.py", "lanes.py", "prepare.py"))
-    for source in [*sorted(package.glob("maps/*.py")), *preparing]:
-        digest.update(source.read_bytes())
-    return digest.hexdigest()
+    """Version of the code that reads and prepares maps; all that may have a part in that counts."""
+    return hash_of_sources("maps", "render")

@@ -19,6 +19,7 @@ from numba.extending import intrinsic, lower_builtin, models, register_model
 LANES = 16
 
 _FLOATS = ir.VectorType(ir.FloatType(), LANES)
+_DOUBLES = ir.VectorType(ir.DoubleType(), LANES)
 _SHORTS = ir.VectorType(ir.IntType(16), LANES)
 _INTS = ir.VectorType(ir.IntType(32), LANES)
 _BITS = ir.VectorType(ir.IntType(1), LANES)
@@ -56,8 +57,9 @@ class _MaskModel(models.PrimitiveModel):
 
 def _spread(builder, number):
     """A vector with the same number in every lane."""
-    first = builder.insert_element(ir.Constant(_FLOATS, ir.Undefined), number, ir.Constant(ir.IntType(32), 0))
-    return builder.shuffle_vector(first, ir.Constant(_FLOATS, ir.Undefined), ir.Constant(_INTS, [0] * LANES))
+    undefined = ir.Constant(ir.VectorType(number.type, LANES), ir.Undefined)
+    first = builder.insert_element(undefined, number, ir.Constant(ir.IntType(32), 0))
+    return builder.shuffle_vector(first, undefined, ir.Constant(_INTS, [0] * LANES))
 
 
 def _define_operator(function, result, emit) -> None:
@@ -155,6 +157,29 @@ def load_halves(typingctx, array, index):
         return builder.fmul(builder.bitcast(bits, _FLOATS), ir.Constant(_FLOATS, [_HALF_SCALE] * LANES), flags=_FLAGS)
 
     return _LANES(array, types.intp), codegen
+
+
+@intrinsic
+def offsets(typingctx, points, origin, axis):
+    """How far points lie from an origin, and how far from it along an axis: (x, y, z, along), in float64 until rounded.
+
+    Args:
+        points: tuple of three Lanes.
+        origin, axis: tuples of three float64.
+    """
+    three = types.UniTuple(types.float64, 3)
+
+    def codegen(context, builder, sig, args):
+        along, differences = ir.Constant(_DOUBLES, [0.0] * LANES), []
+        for i in range(3):
+            values, start, slope = (builder.extract_value(arg, i) for arg in args)
+            difference = builder.fsub(builder.fpext(values, _DOUBLES), _spread(builder, start))
+            along = builder.fadd(along, builder.fmul(difference, _spread(builder, slope), flags=_FLAGS), flags=_FLAGS)
+            differences.append(difference)
+        rounded = (builder.fptrunc(values, _FLOATS) for values in (*differences, along))
+        return context.make_tuple(builder, sig.return_type, rounded)
+
+    return types.UniTuple(_LANES, 4)(types.UniTuple(_LANES, 3), three, three), codegen
 
 
 @intrinsic

@@ -18,6 +18,7 @@ from gsfeatloc_ros.render.lanes import (
     mask_bits,
     maximum,
     minimum,
+    offsets,
     spread,
     sqrt,
     store_columns,
@@ -25,10 +26,10 @@ from gsfeatloc_ros.render.lanes import (
 from gsfeatloc_ros.render.prepare import CHUNK
 
 TILE = 16
-# Fields of a projected splat. The conic is scaled by -log2(e)/2 and opacity is a log2, so that
-# alpha = 2^(LOG_OPACITY + CONIC_XX dx^2 + CONIC_XY dx dy + CONIC_YY dy^2); the box holds the pixels with an alpha of
-# MIN_ALPHA, and is whole numbers.
-(X, Y, CONIC_XX, CONIC_XY, CONIC_YY, LOG_OPACITY, RED, GREEN, BLUE, DEPTH, LEFT, RIGHT, TOP, BOTTOM) = range(14)
+# Fields of a projected splat: alpha = 2^(LOG_OPACITY + CONIC_X (dx - SLANT dy)^2 + CONIC_Y dy^2). Rounding or not, that
+# falls away from the centre; the usual sum of dx^2, dx dy and dy^2 may grow along a long needle. The box holds the
+# pixels with an alpha of MIN_ALPHA, and is whole numbers.
+(X, Y, SLANT, CONIC_X, CONIC_Y, LOG_OPACITY, RED, GREEN, BLUE, DEPTH, LEFT, RIGHT, TOP, BOTTOM) = range(14)
 # One line of the CPU's cache.
 SPLAT_SIZE = 16
 
@@ -99,10 +100,14 @@ def _project_group(chunk, group, gaussians, sh, harmonics, antialiased, view, sp
     """Write the visible ones among LANES Gaussians of a chunk to `splats` from `out` on; return where they end."""
     at = chunk * prepare.ROWS * CHUNK + group
     r = view.rotation
-    ox = load(gaussians, at + prepare.X * CHUNK) - view.origin[0] - view.origin_rest[0]
-    oy = load(gaussians, at + prepare.Y * CHUNK) - view.origin[1] - view.origin_rest[1]
-    oz = load(gaussians, at + prepare.Z * CHUNK) - view.origin[2] - view.origin_rest[2]
-    z = ox * r[2, 0] + oy * r[2, 1] + oz * r[2, 2]
+    points = (
+        load(gaussians, at + prepare.X * CHUNK),
+        load(gaussians, at + prepare.Y * CHUNK),
+        load(gaussians, at + prepare.Z * CHUNK),
+    )
+    # The depth exact to its last bit: splats are drawn in its order, and neighbours are closer than roundings.
+    o, f = view.origin, view.forward
+    ox, oy, oz, z = offsets(points, (o[0], o[1], o[2]), (f[0], f[1], f[2]))
     inverse_z = _ONE / z
     u = (ox * r[0, 0] + oy * r[0, 1] + oz * r[0, 2]) * inverse_z
     v = (ox * r[1, 0] + oy * r[1, 1] + oz * r[1, 2]) * inverse_z
@@ -123,13 +128,14 @@ def _project_group(chunk, group, gaussians, sh, harmonics, antialiased, view, sp
         bx * cax + by * cay + bz * caz,
         bx * cbx + by * cby + bz * cbz,
     )
-    sharp_determinant = cov_xx * cov_yy - cov_xy * cov_xy
+    # That of a long needle would drown in rounding, were it taken after the blur.
+    sharp_determinant = maximum(cov_xx * cov_yy - cov_xy * cov_xy, _ZERO)
+    determinant = sharp_determinant + _EPS2D * (cov_xx + cov_yy + _EPS2D)
     cov_xx, cov_yy = cov_xx + _EPS2D, cov_yy + _EPS2D
-    determinant = cov_xx * cov_yy - cov_xy * cov_xy
 
     log_opacity = load(gaussians, at + prepare.LOG_OPACITY * CHUNK)
     if antialiased:
-        log_opacity = log_opacity + _F(0.5) * log2(maximum(sharp_determinant / determinant, _ZERO))
+        log_opacity = log_opacity + _F(0.5) * log2(sharp_determinant / determinant)
     # The ellipse in which alpha is at least MIN_ALPHA, and the pixels in its box.
     r2 = (log_opacity - _LOG_MIN_ALPHA) * _REACH_SCALE
     reach_x, reach_y = sqrt(r2 * cov_xx), sqrt(r2 * cov_yy)
@@ -141,7 +147,6 @@ def _project_group(chunk, group, gaussians, sh, harmonics, antialiased, view, sp
     if mask_bits(visible) == 0:
         return out
 
-    scale = _CONIC_SCALE / determinant
     inverse_distance = _ONE / sqrt(ox * ox + oy * oy + oz * oz)
     red, green, blue = _colors(
         sh,
@@ -159,9 +164,9 @@ def _project_group(chunk, group, gaussians, sh, harmonics, antialiased, view, sp
         (
             px,
             py,
-            cov_yy * scale,
-            cov_xy * scale * _F(-2),
-            cov_xx * scale,
+            cov_xy / cov_yy,
+            _CONIC_SCALE * cov_yy / determinant,
+            _CONIC_SCALE / cov_yy,
             log_opacity,
             red,
             green,
@@ -233,8 +238,9 @@ def _list_tiles(splats, first, last, tiles_x, tiles, keys, pairs, histogram):
             if has_corners:
                 low, high = max(_F(row * TILE), splats[at + TOP]), min(_F(row * TILE + TILE - 1), splats[at + BOTTOM])
                 band_left, band_right = _ellipse_in_rows(splats, at, low, high)
-                left = np.int64(max(band_left, splats[at + LEFT])) // TILE
-                right = np.int64(min(band_right, splats[at + RIGHT])) // TILE
+                # In this order they are whole numbers even where the ellipse is NaN.
+                left = np.int64(max(splats[at + LEFT], band_left)) // TILE
+                right = np.int64(min(splats[at + RIGHT], band_right)) // TILE
             for tile in range(row * tiles_x + left, row * tiles_x + right + 1):
                 if pairs < len(tiles):
                     tiles[pairs] = tile
@@ -244,25 +250,16 @@ def _list_tiles(splats, first, last, tiles_x, tiles, keys, pairs, histogram):
     return pairs
 
 
-@njit
+@njit(error_model="numpy")
 def _ellipse_in_rows(splats, at, first, last):
     """Leftmost and rightmost x of a splat's ellipse within the rows of pixels `first` to `last`, which it meets."""
-    # a dx^2 + 2 b dx dy + c dy^2 <= level
-    a, b, c = (-splats[at + CONIC_XX], _F(-0.5) * splats[at + CONIC_XY], -splats[at + CONIC_YY])
+    # a (dx - slant dy)^2 + b dy^2 <= level
+    slant, a, b = splats[at + SLANT], -splats[at + CONIC_X], -splats[at + CONIC_Y]
     level = splats[at + LOG_OPACITY] - _LOG_MIN_ALPHA
     low, high = first - splats[at + Y], last - splats[at + Y]
-    widest = math.sqrt(level * c / (a * c - b * b))
-    y_of_rightmost = -b * widest / c  # the leftmost point is its mirror image
+    y_of_rightmost = slant / b * math.sqrt(level / (_ONE / a + slant * slant / b))  # the leftmost is its mirror image
 
-    def edge(y):
-        return math.sqrt(max(b * b * y * y - a * (c * y * y - level), _ZERO))
-
-    left = -widest
-    if not low <= -y_of_rightmost <= high:
-        y = low if -y_of_rightmost < low else high
-        left = (-b * y - edge(y)) / a
-    right = widest
-    if not low <= y_of_rightmost <= high:
-        y = low if y_of_rightmost < low else high
-        right = (-b * y + edge(y)) / a
+    left_y, right_y = min(max(low, -y_of_rightmost), high), min(max(low, y_of_rightmost), high)
+    left = slant * left_y - math.sqrt(max(level - b * left_y * left_y, _ZERO) / a)
+    right = slant * right_y + math.sqrt(max(level - b * right_y * right_y, _ZERO) / a)
     return splats[at + X] + left, splats[at + X] + right

@@ -19,8 +19,8 @@ class View(NamedTuple):
 
     Attributes:
         rotation: (3, 3) float32, splat to camera.
-        origin, origin_rest: (3,) float32 whose sum is the camera's centre: maps may lie far from their origin, and one
-            float32 would not be enough.
+        origin, forward: (3,) float64, the camera's centre and its optical axis: maps may lie far from their origin,
+            where float32 would not be enough.
         fx, fy, cx, cy: float32 intrinsics, pixels.
         left, right, top, bottom: float32 slopes x/z and y/z beyond which a Gaussian is linearised as if it were there.
         width, height: pixels.
@@ -28,7 +28,7 @@ class View(NamedTuple):
 
     rotation: np.ndarray
     origin: np.ndarray
-    origin_rest: np.ndarray
+    forward: np.ndarray
     fx: np.float32
     fy: np.float32
     cx: np.float32
@@ -44,8 +44,6 @@ class View(NamedTuple):
 def view_of(camera: Camera, T_splat_camera: np.ndarray) -> View:
     """The view of `camera` (its distortion ignored) from the pose `T_splat_camera` (4, 4)."""
     (fx, _, cx), (_, fy, cy) = camera.K[0], camera.K[1]
-    center = T_splat_camera[:3, 3]
-    origin = center.astype(np.float32)
     # As in gsplat, 30 % outside the image; the image begins half a pixel before the centre of the first pixel.
     margin_x, margin_y = 0.3 * 0.5 * camera.width / fx, 0.3 * 0.5 * camera.height / fy
     slopes = (
@@ -56,8 +54,8 @@ def view_of(camera: Camera, T_splat_camera: np.ndarray) -> View:
     )
     return View(
         np.ascontiguousarray(T_splat_camera[:3, :3].T, dtype=np.float32),
-        origin,
-        (center - origin).astype(np.float32),
+        np.array(T_splat_camera[:3, 3], dtype=np.float64),
+        np.array(T_splat_camera[:3, 2], dtype=np.float64),
         *(np.float32(value) for value in (fx, fy, cx, cy, *slopes)),
         camera.width,
         camera.height,
@@ -78,7 +76,7 @@ def visible_chunks(view: View, low: np.ndarray, high: np.ndarray) -> np.ndarray:
     ) @ view.rotation.astype(np.float64)
     margins = np.abs([left - view.left, view.right - right, top - view.top, view.bottom - bottom, 0.0])
     limits = np.array([0.0, 0.0, 0.0, 0.0, NEAR_PLANE])
-    return _chunks_inside(low, high, view.origin.astype(np.float64) + view.origin_rest, inward, margins, limits)
+    return _chunks_inside(low, high, view.origin, inward, margins, limits)
 
 
 @njit(nogil=True, cache=True)

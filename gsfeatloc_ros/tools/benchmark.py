@@ -3,6 +3,7 @@
     python -m gsfeatloc_ros.tools.benchmark synthetic --gaussians 1000000 --out map.ply
     python -m gsfeatloc_ros.tools.benchmark render --map map.ply --size 640x480 --json frames.json
     python -m gsfeatloc_ros.tools.benchmark render --scene SCENE
+    python -m gsfeatloc_ros.tools.benchmark opensplat --map map.ply --checkout OpenSplat
     python -m gsfeatloc_ros.tools.benchmark query --scene SCENE --matcher xfeat --json query.json
     python -m gsfeatloc_ros.tools.benchmark scaling --out scaling.png
     python -m gsfeatloc_ros.tools.benchmark pnp
@@ -20,12 +21,14 @@ from typing import Any
 
 import numpy as np
 
-from gsfeatloc_ros.benchmark.frames import measure_map, measure_scene, print_frames
+from gsfeatloc_ros.benchmark.frames import measure_map, measure_scene, pinhole, print_frames, view_of_all
 from gsfeatloc_ros.benchmark.measure import machine
 from gsfeatloc_ros.benchmark.pnp import measure_pnp
 from gsfeatloc_ros.benchmark.query import measure_queries, print_queries
 from gsfeatloc_ros.benchmark.scaling import COUNTS, draw_scaling, measure_scaling
+from gsfeatloc_ros.evaluate.scene import load_scene
 from gsfeatloc_ros.geometry import make_pose, matrix_from_quaternion, quaternion_from_matrix
+from gsfeatloc_ros.maps import load_map
 from gsfeatloc_ros.maps.ply import write_ply
 from gsfeatloc_ros.match import DEFAULT_MATCHER, MATCHERS
 from gsfeatloc_ros.render import DEVICES
@@ -52,24 +55,35 @@ def _parser() -> argparse.ArgumentParser:
     file = argparse.ArgumentParser(add_help=False)
     file.add_argument("--json", type=Path, metavar="FILE", help="write the figures here as well")
 
-    render = commands.add_parser("render", parents=[device, file], help="time of a frame, and of loading the map")
-    source = render.add_mutually_exclusive_group(required=True)
-    source.add_argument("--map", type=Path, help="map file: the same frame again and again, and loading it")
+    frames = argparse.ArgumentParser(add_help=False)
+    source = frames.add_mutually_exclusive_group(required=True)
+    source.add_argument("--map", type=Path, help="map file: the same frame again and again")
     source.add_argument(
         "--scene", type=Path, help="folder with a map and photos: a frame at the pose of each test photo"
     )
-    render.add_argument(
+    frames.add_argument(
         "--size", type=_size, default=(640, 480), metavar="WxH", help="of the frames (default: 640x480)"
     )
-    render.add_argument(
+    frames.add_argument(
         "--pose",
         type=float,
         nargs=7,
         metavar=("X", "Y", "Z", "QX", "QY", "QZ", "QW"),
         help="of the camera (z forward) in the map (default: the whole map in view)",
     )
-    render.add_argument("--frames", type=int, default=20, help="measured at that pose (default: %(default)s)")
+    frames.add_argument("--frames", type=int, default=20, help="measured at that pose (default: %(default)s)")
+
+    render = commands.add_parser(
+        "render", parents=[frames, device, file], help="time of a frame, and of loading the map of --map"
+    )
     render.set_defaults(run=_render)
+
+    opensplat = commands.add_parser(
+        "opensplat", parents=[frames, file], help="time of a frame on the CPU against OpenSplat's, in turns"
+    )
+    opensplat.add_argument("--checkout", type=Path, required=True, help="of OpenSplat's sources, which are built")
+    opensplat.add_argument("--threads", type=int, default=0, help="CPU threads; 0 for one per core")
+    opensplat.set_defaults(run=_opensplat)
 
     query = commands.add_parser("query", parents=[device, file], help="time of a localization, by stage")
     query.add_argument("--scene", type=Path, required=True, help="folder with a map and photos")
@@ -101,17 +115,38 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _render(options: argparse.Namespace) -> None:
-    if options.frames < 1:
-        raise ValueError("--frames must be at least 1")
+    _check_frames(options)
     if options.scene:
-        if options.pose:
-            raise ValueError("--pose is for --map; the frames of a scene are at the poses of its photos")
         report = measure_scene(options.scene, options.size, options.device, options.threads)
     else:
         pose = _pose(options.pose) if options.pose else None
         report = measure_map(options.map, options.size, pose, options.frames, options.device, options.threads)
     print_frames(report)
     _write(options.json, report | {"device": options.device, "threads": options.threads})
+
+
+def _opensplat(options: argparse.Namespace) -> None:
+    # Imported here: torch takes a second, and the other commands do without.
+    from gsfeatloc_ros.benchmark.opensplat import measure_against_opensplat, print_against_opensplat
+
+    _check_frames(options)
+    if options.scene:
+        scene = load_scene(options.scene)
+        gaussian_map, camera = load_map(scene.map_path), scene.camera.scaled(*options.size)
+        poses = [photo.T_map_camera for photo in scene.photos]
+    else:
+        gaussian_map, camera = load_map(options.map), pinhole(options.size)
+        poses = [_pose(options.pose) if options.pose else view_of_all(gaussian_map)] * options.frames
+    report = measure_against_opensplat(options.checkout, gaussian_map, camera, poses, options.threads)
+    print_against_opensplat(report)
+    _write(options.json, report)
+
+
+def _check_frames(options: argparse.Namespace) -> None:
+    if options.frames < 1:
+        raise ValueError("--frames must be at least 1")
+    if options.scene and options.pose:
+        raise ValueError("--pose is for --map; the frames of a scene are at the poses of its photos")
 
 
 def _query(options: argparse.Namespace) -> None:
