@@ -15,6 +15,7 @@ from gsfeatloc_ros.node.diagnostics import ERROR, OK, Reporter
 from gsfeatloc_ros.node.engine import Engine, load_engine
 from gsfeatloc_ros.node.parameters import check_choices, declare_parameters
 from gsfeatloc_ros.node.session import Session
+from gsfeatloc_ros.node.transforms import Transforms
 
 # The clock may go back by less than this without a new run (of a bag, of a simulation) having begun.
 _BACKWARDS = Duration(seconds=-1)
@@ -33,6 +34,8 @@ class LocalizerNode(LifecycleNode):
         super().__init__("localizer")
         self._values = declare_parameters(self)
         self._reporter = Reporter(self)
+        # For good: tf2_ros's listener cannot be taken back.
+        self._transforms = Transforms(self)
         self._session: Session | None = None
         # Path of the map that is being loaded while another serves.
         self._loading = ""
@@ -58,7 +61,8 @@ class LocalizerNode(LifecycleNode):
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Load the map, compile, be ready for requests; a failure is logged with its reason."""
         try:
-            self._session = Session(self, self._values, load_engine(self._values), self._reporter)
+            engine = load_engine(self._values)
+            self._session = Session(self, self._values, engine, self._transforms, self._reporter)
         except (ValueError, OSError, RuntimeError) as error:
             self.get_logger().fatal(str(error))
             return TransitionCallbackReturn.FAILURE

@@ -86,16 +86,18 @@ class Session:
         node: whose topics and services they are.
         values: of all parameters by name.
         engine: that localizes.
+        transforms: what tf knows; it stays when the session ends.
         reporter: to whom it is said how that goes.
 
     Raises:
         ValueError: the parameters do not go together, or tf is needed and not installed.
     """
 
-    def __init__(self, node: Node, values: dict[str, Value], engine: Engine, reporter: Reporter) -> None:
+    def __init__(
+        self, node: Node, values: dict[str, Value], engine: Engine, transforms: Transforms, reporter: Reporter
+    ) -> None:
         self._node, self._values, self._reporter = node, values, reporter
-        self._engine = engine
-        self._transforms = Transforms(node)
+        self._engine, self._transforms = engine, transforms
         self._answers = Answers(node, values, self._transforms)
         self._compressed = values["image.transport"] == "compressed"
         # As image_transport does: a remapping of image holds for the compressed ones as well.
@@ -228,6 +230,7 @@ class Session:
     def _is_due(self, stamp: int) -> bool:
         """Whether an image is to be localized without being asked for."""
         mode, max_rate = self._values["mode"], self._values["max_rate"]
+        stamp = stamp or self._node.get_clock().now().nanoseconds
         if mode == "on_request" or (mode == "on_prior" and not self._prior_pending):
             return False
         # Stamps that go back are those of a bag that starts anew.
@@ -341,6 +344,8 @@ class Session:
         estimate = engine.localizer.localize(
             query.image, query.camera, query.T_map_camera_prior, query.prior_covariance, interrupted
         )
+        if self._engine.renderer is not engine.renderer:
+            return Outcome("refused", "the map was changed while this image was localized: send another")
         pose = self._answers.pose_message(estimate, mount, header) if estimate.localized else None
         if job.shared and self._active:
             if pose is not None:
