@@ -10,7 +10,7 @@ from launch_ros.substitutions import FindPackageShare
 
 from launch import LaunchDescription
 
-TOPICS = ("image", "camera_info", "prior")
+TOPICS = ("image", "camera_info", "prior", "initialpose", "odom")
 
 
 def generate_launch_description() -> LaunchDescription:

@@ -140,7 +140,7 @@ def test_import_without_ros():
     subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
 
 
-@pytest.mark.parametrize(("name", "entities"), [("localizer", 7), ("replay", 6)])
+@pytest.mark.parametrize(("name", "entities"), [("localizer", 9), ("replay", 6)])
 def test_launch_file_makes_a_description(name, entities):
     source = ROOT / "launch" / f"{name}.launch.py"
     code = compile(source.read_text(), source.name, "exec")
