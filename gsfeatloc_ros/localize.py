@@ -64,6 +64,8 @@ class LocalizerOptions:
 _SETTLED_PIXELS = 0.5
 # What a prior's covariance is taken to be at least, as a share of that of a prior without one.
 _LEAST_SHARE_OF_USUAL = 0.01
+# Views nearer to each other than this share of the usual deviations of a prior show the same.
+_APART = 0.3
 # Views are searched in batches of this many; the best of each are followed before the next is rendered.
 _BATCH = 8
 
@@ -158,7 +160,9 @@ class Localizer:
     def _batches(self, query: _Query) -> Iterator[list[np.ndarray]]:
         """Poses (4, 4) to look from: the prior alone, then those around it, a few at a time."""
         yield [query.prior]
-        poses = spread_poses(query.prior, query.prior_covariance, self._options.max_views, self._options.seed)
+        options = self._options
+        apart = _APART * np.sqrt(options.prior_covariance().diagonal())
+        poses = spread_poses(query.prior, query.prior_covariance, apart, options.max_views, options.seed)
         for start in range(0, len(poses), _BATCH):
             yield poses[start : start + _BATCH]
 

@@ -59,16 +59,19 @@ def promising(views: list[MatchedView]) -> list[MatchedView]:
     return [view for view in views[:_FOLLOWED] if view.inliers >= MIN_HINT]
 
 
-def spread_poses(T_map_camera: np.ndarray, covariance: np.ndarray, count: int, seed: int) -> list[np.ndarray]:
-    """Choose `count` poses (4, 4) spread over the uncertainty (6, 6) of a pose, the likely ones first.
+def spread_poses(
+    T_map_camera: np.ndarray, covariance: np.ndarray, apart: np.ndarray, count: int, seed: int
+) -> list[np.ndarray]:
+    """Choose up to `count` poses (4, 4) spread over the uncertainty (6, 6) of a pose, the likely ones first.
 
     Farthest-point sampling (Gonzalez, 1985) among random poses, in units of the standard deviation: no two look at
-    nearly the same thing, and none at what the pose itself has shown.
+    nearly the same thing, and none at what the pose itself has shown. Of a pose that is known well there are fewer.
 
     Args:
         T_map_camera: (4, 4).
         covariance: (6, 6), ROS order (x y z, rotation about x y z), axes of the map frame, map units and radians.
-        count: number of poses.
+        apart: (6,) how far from each other poses have to be in each coordinate, all together, to show something else.
+        count: most poses.
         seed: the same seed gives the same poses.
     """
     rng = np.random.default_rng(seed)
@@ -83,7 +86,8 @@ def spread_poses(T_map_camera: np.ndarray, covariance: np.ndarray, count: int, s
         chosen.append(normal[farthest])
         distance = np.minimum(distance, np.linalg.norm(normal - normal[farthest], axis=1))
     chosen.sort(key=np.linalg.norm)
-    return [
-        make_pose(so3_exp((root @ step)[3:]) @ T_map_camera[:3, :3], T_map_camera[:3, 3] + (root @ step)[:3])
-        for step in chosen
-    ]
+    steps = [np.zeros(6)]
+    for step in (root @ point for point in chosen):
+        if min(np.linalg.norm((step - other) / apart) for other in steps) >= 1:
+            steps.append(step)
+    return [make_pose(so3_exp(step[3:]) @ T_map_camera[:3, :3], T_map_camera[:3, 3] + step[:3]) for step in steps[1:]]

@@ -17,6 +17,8 @@ from gsfeatloc_ros.search import SEARCH_WIDTH, look, promising, spread_poses
 from gsfeatloc_ros.timing import StageClock
 from gsfeatloc_ros.view import MatchedView
 
+# However near to each other views are.
+ANY = np.full(6, 1e-12)
 POSE = make_pose(so3_exp(np.array([0.3, -0.2, 1.0])), np.array([1.0, 2.0, 3.0]))
 
 
@@ -29,7 +31,7 @@ def steps(poses: list[np.ndarray]) -> np.ndarray:
 @given(count=st.integers(0, 40), seed=st.integers(0, 2**32 - 1))
 def test_views_stay_within_the_uncertainty_and_come_likely_first(count: int, seed: int) -> None:
     sigmas = np.array([0.5, 0.1, 0.3, 0.2, 0.4, 0.1])
-    poses = spread_poses(POSE, np.diag(sigmas**2), count, seed)
+    poses = spread_poses(POSE, np.diag(sigmas**2), ANY, count, seed)
     assert len(poses) == count
     if count:
         distance = np.linalg.norm(steps(poses) / sigmas, axis=1)
@@ -40,7 +42,7 @@ def test_views_stay_within_the_uncertainty_and_come_likely_first(count: int, see
 def test_views_follow_the_correlations_of_the_prior() -> None:
     root = np.random.default_rng(0).normal(scale=0.2, size=(6, 6))
     covariance = root @ root.T
-    whitened = np.linalg.solve(np.linalg.cholesky(covariance), steps(spread_poses(POSE, covariance, 200, 0)).T)
+    whitened = np.linalg.solve(np.linalg.cholesky(covariance), steps(spread_poses(POSE, covariance, ANY, 200, 0)).T)
     # Spread out, not drawn: as wide in all directions, and wider than a normal distribution.
     deviation = np.sqrt(np.linalg.eigvalsh(np.cov(whitened)))
     assert deviation[0] > 0.9
@@ -53,17 +55,32 @@ def test_views_are_spread_more_evenly_than_random_ones() -> None:
         return float(distance.min())
 
     random = np.random.default_rng(0).normal(size=(30, 6))
-    assert nearest(steps(spread_poses(POSE, np.eye(6) * 0.01, 30, 0)) / 0.1) > 1.5 * nearest(random)
+    assert nearest(steps(spread_poses(POSE, np.eye(6) * 0.01, ANY, 30, 0)) / 0.1) > 1.5 * nearest(random)
 
 
 def test_the_same_seed_gives_the_same_views() -> None:
-    a, b = (np.array(spread_poses(POSE, np.eye(6), 10, seed=3)) for _ in range(2))
+    a, b = (np.array(spread_poses(POSE, np.eye(6), ANY, 10, seed=3)) for _ in range(2))
     np.testing.assert_array_equal(a, b)
+
+
+def test_a_pose_that_is_known_well_has_fewer_views_around_it() -> None:
+    apart = np.array([0.15] * 3 + [np.radians(4.5)] * 3)
+
+    def views(share: float) -> list[np.ndarray]:
+        return spread_poses(POSE, share**2 * np.diag((apart / 0.3) ** 2), apart, 32, 0)
+
+    assert len(views(1.0)) == 32
+    assert 1 <= len(views(0.1)) < 32
+    assert len(views(0.05)) == 0
+    for share in (1.0, 0.1):
+        points = np.vstack([np.zeros(6), steps(views(share)) / apart])
+        distance = np.linalg.norm(points[:, None] - points[None], axis=2)[np.triu_indices(len(points), 1)]
+        assert distance.min() > 1 - 1e-6
 
 
 @pytest.mark.parametrize("covariance", [np.zeros((6, 6)), np.diag([0, 0, 0, 0, 0, 0.1]), -np.eye(6)])
 def test_a_covariance_without_extent_is_no_harm(covariance) -> None:
-    for pose in spread_poses(POSE, covariance, 5, 0):
+    for pose in spread_poses(POSE, covariance, ANY, 5, 0):
         assert np.isfinite(pose).all()
         np.testing.assert_allclose(pose[:3, 3], POSE[:3, 3])
 
