@@ -11,7 +11,14 @@ import numpy as np
 
 from gsfeatloc_ros.camera import Camera
 from gsfeatloc_ros.geometry import invert, rotate_covariance, shift_covariance
-from gsfeatloc_ros.messages import decode_camera, decode_covariance, decode_picture, decode_pose, nanoseconds
+from gsfeatloc_ros.messages import (
+    decode_camera,
+    decode_covariance,
+    decode_picture,
+    decode_pose,
+    nanoseconds,
+    picture_size,
+)
 from gsfeatloc_ros.odometry import Odometry
 
 T = TypeVar("T")
@@ -206,15 +213,14 @@ class Inputs:
                 which no way is known.
         """
         camera, rough = camera or self._camera.get(), rough or self._rough.get()
-        image = decode_picture(message)
-        height, width = image.shape[:2]
+        width, height = picture_size(message)
         if (camera.width, camera.height) != (width, height):
             raise ValueError(
                 f"camera_info is for {camera.width}x{camera.height} but the image is {width}x{height}: use the "
                 "camera_info of this image"
             )
         pose, covariance = self._at(rough, nanoseconds(message.header.stamp), message.header.frame_id)
-        return Query(image, camera, pose, covariance, rough)
+        return Query(decode_picture(message), camera, pose, covariance, rough)
 
     def _at(self, rough: RoughPose, stamp: int, camera_frame: str) -> tuple[np.ndarray, np.ndarray | None]:
         """Pose (4, 4) and covariance (6, 6) of the camera in the map frame at `stamp`, as far as `rough` says."""

@@ -254,8 +254,11 @@ class _Query:
         added.
         """
         step = np.concatenate([pose[:3, 3] - self.prior[:3, 3], so3_log(pose[:3, :3] @ self.prior[:3, :3].T)])
-        covariance = self.prior_covariance + _LEAST_SHARE_OF_USUAL * usual_covariance
-        return float(np.sqrt(max(step @ np.linalg.solve(covariance, step), 0.0)))
+        # In units of the usual deviations; what is no covariance (correlations beyond 1) opens no gate.
+        unit = np.sqrt(usual_covariance.diagonal())
+        values, vectors = np.linalg.eigh(0.5 * (self.prior_covariance + self.prior_covariance.T) / np.outer(unit, unit))
+        variances = np.clip(values, 0.0, None) + _LEAST_SHARE_OF_USUAL
+        return float(np.linalg.norm(vectors.T @ (step / unit) / np.sqrt(variances)))
 
 
 def _nothing_in_common(features: int, best: MatchedView, views: int) -> Estimate:

@@ -22,6 +22,8 @@ Image = CompressedImage = CameraInfo = PoseStamped = PoseWithCovarianceStamped =
 
 # No camera is larger; a message that says so is corrupt.
 MAX_SIDE = 16384
+# Of a prior; a larger one says nothing, and products of it overflow.
+_MAX_VARIANCE = 1e12
 
 
 @dataclass(frozen=True)
@@ -159,6 +161,7 @@ def decode_compressed_image(message: CompressedImage) -> np.ndarray:
         raise ValueError(f"image of format {message.format!r} is a depth image: take the topic of the pictures")
     if encoding.startswith("bayer") and not compression.strip().endswith(("bgr8", "rgb8")):
         raise ValueError(f"image of format {message.format!r} has no colours yet: take the topic of the colour images")
+    picture_size(message)
     try:
         bgr = cv2.imdecode(np.frombuffer(message.data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error as error:
@@ -168,6 +171,45 @@ def decode_compressed_image(message: CompressedImage) -> np.ndarray:
             f"image of format {message.format!r}, {len(message.data)} bytes, is damaged, or no JPEG or PNG"
         )
     return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
+
+
+def picture_size(message: Image | CompressedImage) -> tuple[int, int]:
+    """Width and height of the picture in an image message of either type, without decoding it.
+
+    Raises:
+        ValueError: no JPEG or PNG, or a size that no camera has: a few bytes can declare gigabytes.
+    """
+    if not hasattr(message, "format"):
+        return message.width, message.height
+    data = bytes(message.data)
+    width, height = _png_size(data) or _jpeg_size(data) or (0, 0)
+    if not width or not height:
+        raise ValueError(f"image of format {message.format!r}, {len(data)} bytes, is damaged, or no JPEG or PNG")
+    if width > MAX_SIDE or height > MAX_SIDE:
+        raise ValueError(f"image size {width}x{height} must be 1 to {MAX_SIDE} pixels a side: check the camera driver")
+    return width, height
+
+
+def _png_size(data: bytes) -> tuple[int, int] | None:
+    if not data.startswith(b"\x89PNG\r\n\x1a\n"):
+        return None
+    return int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")
+
+
+def _jpeg_size(data: bytes) -> tuple[int, int] | None:
+    """Of the first frame header: a marker from C0 to CF, but for three that are of tables (ITU-T T.81, table B.1)."""
+    place = 2
+    while data.startswith(b"\xff\xd8") and place + 9 <= len(data):
+        marker = data[place + 1]
+        if marker == 0xFF:  # any number of these may come before a marker
+            place += 1
+        elif 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
+            return int.from_bytes(data[place + 7 : place + 9], "big"), int.from_bytes(
+                data[place + 5 : place + 7], "big"
+            )
+        else:
+            place += 2 + int.from_bytes(data[place + 2 : place + 4], "big")
+    return None
 
 
 def decode_camera(message: CameraInfo, rectified: bool = False) -> Camera:
@@ -247,6 +289,9 @@ def decode_covariance(message: PoseStamped | PoseWithCovarianceStamped, name: st
     covariance = np.array(values, dtype=np.float64).reshape(6, 6)
     if not np.isfinite(covariance).all() or covariance.diagonal().min() < 0:
         raise ValueError(f"{name} has covariance {covariance.tolist()}: all must be finite, and no variance negative")
+    largest = np.abs(covariance).max()
+    if largest > _MAX_VARIANCE:
+        raise ValueError(f"{name} has covariances up to {largest:g} (at most {_MAX_VARIANCE:g}): zeros mean unknown")
     return covariance
 
 

@@ -146,15 +146,15 @@ def test_exception_goes_to_the_future_and_the_thread_lives_on():
     assert worker.stop(TIMEOUT)
 
 
-def test_stop_lets_the_running_work_end_and_cancels_what_waits(gate):
+def test_stop_interrupts_the_running_work_and_cancels_what_waits(gate):
     worker = Worker(gate)
     running = worker.request("a")
     gate.wait_until_started()
     waiting = worker.request("b")
     worker.offer("c")
-    gate.go.release()
     assert worker.stop(TIMEOUT)
-    assert running.result(0) == "did a"
+    with pytest.raises(Interrupted):
+        running.result(0)
     with pytest.raises(CancelledError):
         waiting.result(0)
     with pytest.raises(CancelledError):
@@ -163,12 +163,18 @@ def test_stop_lets_the_running_work_end_and_cancels_what_waits(gate):
     assert gate.items == ["a"]
 
 
-def test_stop_does_not_wait_for_ever(gate):
-    worker = Worker(gate)
+def test_stop_does_not_wait_for_ever():
+    started, go = threading.Event(), threading.Event()
+
+    def stubborn(item, interrupted):
+        started.set()
+        assert go.wait(TIMEOUT)
+
+    worker = Worker(stubborn)
     worker.request("a")
-    gate.wait_until_started()
+    assert started.wait(TIMEOUT)
     assert not worker.stop(0.05)
-    gate.go.release()
+    go.set()
 
 
 def test_stop_without_work():

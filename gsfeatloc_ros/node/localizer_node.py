@@ -2,25 +2,31 @@
 
 from __future__ import annotations
 
+import os
 import threading
-from pathlib import Path
+from typing import Any
 
+from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.msg import SetParametersResult
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import JumpThreshold, TimeJump
 from rclpy.duration import Duration
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
+from std_srvs.srv import Trigger
 
 from gsfeatloc_ros.node.diagnostics import ERROR, OK, Reporter
 from gsfeatloc_ros.node.engine import Engine, load_engine
 from gsfeatloc_ros.node.parameters import check_choices, declare_parameters
-from gsfeatloc_ros.node.session import Session
+from gsfeatloc_ros.node.session import LocalizeImage, Session
 from gsfeatloc_ros.node.transforms import Transforms
 
 # The clock may go back by less than this without a new run (of a bag, of a simulation) having begun.
 _BACKWARDS = Duration(seconds=-1)
 # Seconds that the running localization gets to end when the node is cleaned up.
 _STOP_TIMEOUT = 3.0
+_UNCONFIGURED = "the node is not configured: configure and activate it (ros2 lifecycle set ... configure)"
 
 
 class LocalizerNode(LifecycleNode):
@@ -41,6 +47,19 @@ class LocalizerNode(LifecycleNode):
         self._loading = ""
         # Whether map.path is set to that of the old map because the new one could not be loaded.
         self._going_back = False
+        # They outlive the session, whose last answers would find no service to be sent by. Reentrant: a request that
+        # waits for the worker must not hold up the next one.
+        group = ReentrantCallbackGroup()
+        self.create_service(Trigger, "~/relocalize", self._on_relocalize, callback_group=group)
+        if LocalizeImage is None:
+            self.get_logger().info(
+                "the service ~/localize_image is off: build the package gsfeatloc_interfaces (interfaces/), source it"
+            )
+        else:
+            self.create_service(LocalizeImage, "~/localize_image", self._on_localize_image, callback_group=group)
+        # rclpy answers a transition that the state does not allow with an exception that ends the process.
+        self._change_state = self._service_change_state.callback
+        self._service_change_state.callback = self._on_change_state
         self.add_on_set_parameters_callback(self._check_parameters)
         self.add_post_set_parameters_callback(self._use_parameters)
         threshold = JumpThreshold(min_forward=None, min_backward=_BACKWARDS, on_clock_change=False)
@@ -92,6 +111,28 @@ class LocalizerNode(LifecycleNode):
         self._session.deactivate()
         return self.on_cleanup(state)
 
+    def _on_change_state(self, request: ChangeState.Request, response: ChangeState.Response) -> ChangeState.Response:
+        try:
+            return self._change_state(request, response)
+        except rclpy_implementation.RCLError as error:
+            self.get_logger().warning(f"transition {request.transition.id} is not taken: {error}")
+            response.success = False
+            return response
+
+    # Requests.
+
+    async def _on_relocalize(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        if self._session is None:
+            response.success, response.message = False, _UNCONFIGURED
+            return response
+        return await self._session.on_relocalize(request, response)
+
+    async def _on_localize_image(self, request: Any, response: Any) -> Any:
+        if self._session is None:
+            response.status, response.reason = response.REFUSED, _UNCONFIGURED
+            return response
+        return await self._session.on_localize_image(request, response)
+
     # Parameters.
 
     def _check_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
@@ -101,7 +142,7 @@ class LocalizerNode(LifecycleNode):
             if "map.path" in new and not self._going_back:
                 if self._loading:
                     raise ValueError(f"map {self._loading} is being loaded: wait for it")
-                if not Path(new["map.path"]).exists():
+                if not os.path.exists(new["map.path"]):
                     raise ValueError(f"map.path: there is no {new['map.path']!r}")
         except ValueError as error:
             return SetParametersResult(successful=False, reason=str(error))

@@ -12,7 +12,7 @@ import rclpy.task
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
-from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
@@ -122,18 +122,10 @@ class Session:
         self._active = False
         self._subscriptions: list[Subscription] = []
         self._worker: Worker[Job, Outcome] = Worker(self._attempt)
-        # Reentrant: a request that waits for the worker must not hold up the next one.
-        group = ReentrantCallbackGroup()
-        self._services = [node.create_service(Trigger, "~/relocalize", self._on_relocalize, callback_group=group)]
-        if LocalizeImage is None:
-            node.get_logger().info(
-                "the service ~/localize_image is off: build the package gsfeatloc_interfaces (interfaces/), source it"
-            )
-        else:
-            self._services.append(
-                node.create_service(LocalizeImage, "~/localize_image", self._on_localize_image, callback_group=group)
-            )
-        self._timer = node.create_timer(_HEALTH_PERIOD, self._tell_health)
+        # On a clock of its own: that of a simulation may stand still.
+        self._timer = node.create_timer(
+            _HEALTH_PERIOD, self._tell_health, clock=Clock(clock_type=ClockType.STEADY_TIME)
+        )
 
     # What the node asks for, in the executor's thread.
 
@@ -170,7 +162,7 @@ class Session:
         self._answers.forget()
 
     def stop(self, timeout: float) -> bool:
-        """Let the running localization end, for up to `timeout` seconds; say whether it did.
+        """Have the running localization given up; say whether it ended within `timeout` seconds.
 
         Requests that still wait are answered when the executor spins on.
         """
@@ -179,8 +171,6 @@ class Session:
     def close(self) -> None:
         """Take back all that was made, but for the subscriptions, which `deactivate` does."""
         self._node.destroy_timer(self._timer)
-        for service in self._services:
-            self._node.destroy_service(service)
         self._answers.close()
 
     @property
@@ -262,7 +252,8 @@ class Session:
             return False
         return True
 
-    async def _on_relocalize(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    async def on_relocalize(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """Localize the newest image."""
         problems = [] if isinstance(self._job, Job) else [self._job]
         if not problems and self._health.silence > self._values["image.timeout"]:
             problems = [f"the newest image came {self._health.silence:.1f} s ago: is the camera running?"]
@@ -276,8 +267,8 @@ class Session:
         response.success, response.message = outcome.pose is not None, outcome.reason
         return response
 
-    async def _on_localize_image(self, request: Any, response: Any) -> Any:
-        """Answer a LocalizeImage."""
+    async def on_localize_image(self, request: Any, response: Any) -> Any:
+        """Localize the image of a LocalizeImage."""
         try:
             if not self._active:
                 raise ValueError(_INACTIVE)
@@ -301,7 +292,8 @@ class Session:
         answer, executor = rclpy.task.Future(), self._node.executor
 
         def pass_on(done: Future[Outcome]) -> None:
-            outcome = Outcome("refused", "the node is stopping") if done.cancelled() else done.result()
+            stopped = done.cancelled() or isinstance(done.exception(), Interrupted)
+            outcome = Outcome("refused", "the node is stopping") if stopped else done.result()
             # Setting the answer in a task wakes the executor, which then resumes this coroutine.
             executor.create_task(answer.set_result, outcome)
 

@@ -81,10 +81,12 @@ class Worker(Generic[Item, Result]):
         return task.future
 
     def stop(self, timeout: float) -> bool:
-        """Cancel what waits, let the running work end for up to `timeout` seconds, and say whether it ended."""
+        """Cancel what waits, interrupt the running work, and say whether it ended within `timeout` seconds."""
         with self._changed:
             self._stopping = True
             waiting, self._requested, self._offered = self._requested, deque(), None
+            if self._running:
+                self._running.interrupted.set()
             self._changed.notify()
         for task in waiting:
             task.future.cancel()

@@ -17,7 +17,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from gsfeatloc_ros.kernel_cache import hash_of_sources
-from gsfeatloc_ros.maps import Similarity, load_map
+from gsfeatloc_ros.maps import MapError, Similarity, load_map
 from gsfeatloc_ros.render.prepare import PreparedMap, prepare
 
 SUFFIX = ".gsfeatloc-cache"
@@ -56,7 +56,10 @@ def load_prepared(
     path = Path(path)
     absolute = Path(os.path.abspath(path))
     cache_path = absolute.with_name(absolute.name + SUFFIX) if cache_path is None else Path(cache_path)
-    origin = _origin(absolute)
+    try:
+        origin = _origin(absolute)
+    except OSError as error:
+        raise MapError(f"{path}: cannot be read: {error.strerror or error}") from error
     prepared = _read_if_usable(cache_path, origin)
     if prepared is None:
         prepared = prepare(load_map(path))
