@@ -65,3 +65,29 @@ def shared() -> Path:
     if not path.is_dir():
         pytest.skip(f"{path} is absent: it holds the real maps and scenes")
     return path
+
+
+@pytest.fixture
+def query(room_queries: list[Query]) -> Query:
+    return room_queries[0]
+
+
+# What talks to ROS is imported in here: see pytest_configure.
+
+
+@pytest.fixture(scope="module")
+def localizer(room_map_file: Path):
+    """The installed localizer, ready, with the map of the room; one for all tests of a file."""
+    from node_harness import running_localizer
+
+    with running_localizer(map__path=room_map_file) as process:
+        yield process
+
+
+@pytest.fixture
+def client(localizer):
+    """A camera and a robot that have found the localizer."""
+    from node_harness import connected_client
+
+    with connected_client() as client:
+        yield client

@@ -37,6 +37,7 @@ from gsfeatloc_ros.geometry import (
     rotation_error_deg,
     translation_error,
 )
+from gsfeatloc_ros.simulate import Query
 
 # Seconds. Generous: the first start on a machine compiles kernels, and CI machines are slow and shared.
 START_TIMEOUT = 180.0
@@ -100,7 +101,8 @@ class NodeProcess:
         return status
 
     def end(self) -> None:
-        """Make sure that it is gone."""
+        """Make sure that it is gone; if it still ran, that it left in order."""
+        ran = self.alive
         self._process.terminate()
         try:
             self.wait()
@@ -108,6 +110,8 @@ class NodeProcess:
             self._process.kill()
             self.wait()
         self._process.stdout.close()
+        # Until Python has started there is nobody who could handle the signal.
+        assert not ran or self._process.returncode in (0, -signal.SIGTERM), self.output
 
     def _read(self) -> None:
         for line in self._process.stdout:
@@ -398,3 +402,40 @@ def assert_close(message: PoseWithCovarianceStamped, T_map_camera: np.ndarray) -
     pose = matrix_of(message)
     assert rotation_error_deg(pose, T_map_camera) < 1.0
     assert translation_error(pose, T_map_camera) < 0.02
+
+
+def send_inputs(client: Client, camera: Camera, query: Query) -> None:
+    """The camera_info and the prior with which a query can be answered."""
+    client.send_camera_info(info_of(camera))
+    client.send_prior(prior_of(query.T_map_camera_prior))
+
+
+def stamped(message: object, seconds: int) -> object:
+    """The message, with this stamp."""
+    message.header.stamp = Time(sec=seconds)
+    return message
+
+
+def attempt_at(client: Client, image: Image, seconds: int | None) -> Diagnostic:
+    """Send an image, of this stamp or of a new one, until the localizer has said something on it."""
+    if seconds is None:
+        return client.attempt(image)
+    stamped(image, seconds)
+    return client.until_diagnosed(lambda: client.send_image(image), lambda d: d.values.get("stamp") == text(image))
+
+
+def assert_answer(client: Client, query: Query, seconds: int | None = None) -> None:
+    """The query's image, with this stamp or a new one, is answered rightly."""
+    image = rgb_image(query.image)
+    diagnostic = attempt_at(client, image, seconds)
+    assert diagnostic.ok, diagnostic
+    assert_close(client.pose_of(image), query.T_map_camera)
+
+
+def assert_no_answer(client: Client, query: Query, says: str, seconds: int | None = None) -> None:
+    """The query's image, with this stamp or a new one, gets no pose, for a reason that matches."""
+    image = rgb_image(query.image)
+    diagnostic = attempt_at(client, image, seconds)
+    assert not diagnostic.ok
+    assert re.search(says, diagnostic.reason), diagnostic
+    assert client.pose_of(image) is None

@@ -5,39 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import pytest
 from node_harness import (
-    Client,
     assert_close,
     connected_client,
-    info_of,
-    prior_of,
     rgb_image,
-    running_localizer,
+    send_inputs,
     text,
 )
-
-
-@pytest.fixture(scope="module")
-def localizer(room_map_file):
-    with running_localizer(map__path=room_map_file, matcher__name="sift") as process:
-        yield process
-
-
-@pytest.fixture
-def client(localizer):
-    with connected_client() as client:
-        yield client
-
-
-@pytest.fixture
-def query(room_queries):
-    return room_queries[0]
-
-
-def send_inputs(client: Client, camera, query) -> None:
-    client.send_camera_info(info_of(camera))
-    client.send_prior(prior_of(query.T_map_camera_prior))
 
 
 def test_image_and_prior_give_the_pose(client, room_camera, query):

@@ -2,49 +2,18 @@
 
 from __future__ import annotations
 
-import re
-
 from builtin_interfaces.msg import Time
 from node_harness import (
-    Client,
-    Diagnostic,
-    assert_close,
+    assert_answer,
+    assert_no_answer,
     connected_client,
     info_of,
     prior_of,
     rgb_image,
     running_localizer,
-    text,
+    stamped,
 )
 from rosgraph_msgs.msg import Clock
-
-
-def stamped(message, seconds: int):
-    message.header.stamp = Time(sec=seconds)
-    return message
-
-
-def attempt_at(client: Client, image, seconds: int) -> Diagnostic:
-    """Send an image of this stamp until the localizer has said something on it."""
-    stamped(image, seconds)
-    return client.until_diagnosed(lambda: client.send_image(image), lambda d: d.values.get("stamp") == text(image))
-
-
-def assert_answer(client: Client, query, seconds: int | None = None) -> None:
-    """An image, with this stamp or a new one, is answered rightly."""
-    image = rgb_image(query.image)
-    diagnostic = client.attempt(image) if seconds is None else attempt_at(client, image, seconds)
-    assert diagnostic.ok, diagnostic
-    assert_close(client.pose_of(image), query.T_map_camera)
-
-
-def assert_no_answer(client: Client, query, says: str, seconds: int | None = None) -> None:
-    """An image, with this stamp or a new one, gets no pose, for a reason that matches."""
-    image = rgb_image(query.image)
-    diagnostic = client.attempt(image) if seconds is None else attempt_at(client, image, seconds)
-    assert not diagnostic.ok
-    assert re.search(says, diagnostic.reason), diagnostic
-    assert client.pose_of(image) is None
 
 
 def test_clock_jumps_back(room_map_file, room_camera, room_queries):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from node_harness import (
     Client,
-    assert_close,
+    assert_answer,
     connected_client,
     info_of,
     prior_of,
@@ -17,23 +17,6 @@ from node_harness import (
     running_localizer,
 )
 from sensor_msgs.msg import CameraInfo, Image
-
-
-@pytest.fixture(scope="module")
-def localizer(room_map_file):
-    with running_localizer(map__path=room_map_file, matcher__name="sift") as process:
-        yield process
-
-
-@pytest.fixture
-def client(localizer):
-    with connected_client() as client:
-        yield client
-
-
-@pytest.fixture
-def query(room_queries):
-    return room_queries[0]
 
 
 @pytest.fixture
@@ -59,14 +42,6 @@ def assert_no_answer(client: Client, localizer, image: Image, says: str) -> None
     assert diagnostic.values["status"] in ("refused", "failed")
     localizer.wait_for_output(rf"\[WARN\].*{says}")
     assert client.pose_of(image) is None
-
-
-def assert_answer(client: Client, query) -> None:
-    """The next good image is answered."""
-    image = rgb_image(query.image)
-    diagnostic = client.attempt(image)
-    assert diagnostic.ok, diagnostic
-    assert_close(client.pose_of(image), query.T_map_camera)
 
 
 def test_no_prior_yet(room_map_file, good_info, good_prior, query):

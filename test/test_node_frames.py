@@ -41,11 +41,6 @@ def tf(monkeypatch):
 
 
 @pytest.fixture
-def query(room_queries):
-    return room_queries[0]
-
-
-@pytest.fixture
 def T_map_base(query):
     """The base on the floor under the camera, turned as the camera is."""
     ahead = query.T_map_camera[:3, 2]

@@ -5,7 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from node_harness import assert_close, compressed_image, connected_client, info_of, prior_of, running_localizer
+from node_harness import (
+    assert_close,
+    compressed_image,
+    connected_client,
+    info_of,
+    prior_of,
+    running_localizer,
+)
 from sensor_msgs.msg import CompressedImage
 
 from gsfeatloc_ros.geometry import make_pose, so3_exp
@@ -21,11 +28,6 @@ def localizer(room_map_file):
 def client(localizer):
     with connected_client("compressed") as client:
         yield client
-
-
-@pytest.fixture
-def query(room_queries):
-    return room_queries[0]
 
 
 @pytest.fixture

@@ -21,12 +21,14 @@ from node_harness import (
     SILENCE,
     Client,
     Diagnostic,
+    assert_answer,
     assert_close,
     connected_client,
     info_of,
     prior_of,
     rgb_image,
     running_localizer,
+    send_inputs,
     text,
 )
 from rclpy.serialization import serialize_message
@@ -51,11 +53,6 @@ def client(localizer, room_camera, room_queries):
 
 
 @pytest.fixture
-def query(room_queries):
-    return room_queries[0]
-
-
-@pytest.fixture
 def good(client, localizer, room_camera, query):
     """The localizer with good inputs; after a test it is still there and able to answer."""
     assert localizer.alive, localizer.output
@@ -66,17 +63,8 @@ def good(client, localizer, room_camera, query):
 
 
 def send_good(client: Client, camera, query) -> None:
-    client.send_camera_info(info_of(camera))
-    client.send_prior(prior_of(query.T_map_camera_prior))
+    send_inputs(client, camera, query)
     assert_answer(client, query)
-
-
-def assert_answer(client: Client, query) -> None:
-    """The next good image is answered rightly."""
-    image = rgb_image(query.image)
-    diagnostic = client.attempt(image)
-    assert diagnostic.ok, diagnostic
-    assert_close(client.pose_of(image), query.T_map_camera)
 
 
 # Messages of each topic

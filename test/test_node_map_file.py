@@ -16,12 +16,13 @@ from node_harness import (
     RESEND_PERIOD,
     TIMEOUT,
     Client,
+    assert_answer,
     assert_close,
     connected_client,
-    info_of,
     prior_of,
     rgb_image,
     running_localizer,
+    send_inputs,
     text,
 )
 
@@ -71,23 +72,9 @@ def connected(localizer):
 @pytest.fixture
 def client(connected, localizer, room_camera, query):
     assert localizer.alive, localizer.output
-    connected.send_camera_info(info_of(room_camera))
-    connected.send_prior(prior_of(query.T_map_camera_prior))
+    send_inputs(connected, room_camera, query)
     yield connected
     assert "Traceback" not in localizer.output
-
-
-@pytest.fixture
-def query(room_queries):
-    return room_queries[0]
-
-
-def assert_answer(client: Client, query) -> None:
-    """The next image is answered rightly."""
-    image = rgb_image(query.image)
-    diagnostic = client.attempt(image)
-    assert diagnostic.ok, diagnostic
-    assert_close(client.pose_of(image), query.T_map_camera)
 
 
 def send_image(client: Client, query) -> str:

@@ -12,18 +12,11 @@ from node_harness import (
     info_of,
     prior_of,
     rgb_image,
-    running_localizer,
     text,
 )
 from rcl_interfaces.srv import DescribeParameters
 from sensor_msgs.msg import Image
 from std_msgs.msg import Header
-
-
-@pytest.fixture(scope="module")
-def localizer(room_map_file):
-    with running_localizer(map__path=room_map_file) as process:
-        yield process
 
 
 @pytest.fixture
@@ -33,11 +26,6 @@ def client(localizer, room_camera):
         yield client
         for name, value in {"mode": "continuous", "max_rate": 0.0}.items():
             assert client.set_parameter(name, value).successful
-
-
-@pytest.fixture
-def query(room_queries):
-    return room_queries[0]
 
 
 def test_on_request_only_services_localize(client, query):

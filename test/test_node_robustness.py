@@ -12,19 +12,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus
 from node_harness import (
     TIMEOUT,
     Client,
-    Diagnostic,
+    assert_answer,
     assert_close,
+    assert_no_answer,
     connected_client,
-    info_of,
     prior_of,
-    rgb_image,
     running_localizer,
-    text,
+    send_inputs,
+    stamped,
 )
 
 # A signal in the middle of a localization may take so long to end the node, in seconds, on a slow machine.
@@ -43,44 +42,6 @@ def client(localizer):
     with connected_client() as client:
         yield client
     assert "Traceback" not in localizer.output
-
-
-@pytest.fixture
-def query(room_queries):
-    return room_queries[0]
-
-
-def send_inputs(client: Client, camera, query) -> None:
-    client.send_camera_info(info_of(camera))
-    client.send_prior(prior_of(query.T_map_camera_prior))
-
-
-def stamped(message, seconds: int):
-    message.header.stamp = Time(sec=seconds)
-    return message
-
-
-def attempt_at(client: Client, image, seconds: int) -> Diagnostic:
-    """Send an image of this stamp until the localizer has said something on it."""
-    stamped(image, seconds)
-    return client.until_diagnosed(lambda: client.send_image(image), lambda d: d.values.get("stamp") == text(image))
-
-
-def assert_answer(client: Client, query, seconds: int | None = None) -> None:
-    """An image, with this stamp or a new one, is answered rightly."""
-    image = rgb_image(query.image)
-    diagnostic = client.attempt(image) if seconds is None else attempt_at(client, image, seconds)
-    assert diagnostic.ok, diagnostic
-    assert_close(client.pose_of(image), query.T_map_camera)
-
-
-def assert_no_answer(client: Client, query, says: str, seconds: int | None = None) -> None:
-    """An image, with this stamp or a new one, gets no pose, for a reason that matches."""
-    image = rgb_image(query.image)
-    diagnostic = client.attempt(image) if seconds is None else attempt_at(client, image, seconds)
-    assert not diagnostic.ok
-    assert re.search(says, diagnostic.reason), diagnostic
-    assert client.pose_of(image) is None
 
 
 def assert_health(client: Client, level: bytes, says: str = "") -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import faulthandler
 import os
 import signal
 import sys
@@ -13,6 +14,8 @@ from types import FrameType
 # Seconds that the running localization gets to end after a signal, and requests in progress to be answered.
 _STOP_TIMEOUT = 3.0
 _ANSWER_TIME = 0.5
+# Seconds after which a process that still has not left is ended.
+_LEAVE_TIMEOUT = 10.0
 # How often spinning looks for a signal, in seconds.
 _SIGNAL_PERIOD = 0.1
 
@@ -47,6 +50,8 @@ def main(args: list[str] | None = None) -> int:
     while not stopping.is_set():
         executor.spin_once(timeout_sec=_SIGNAL_PERIOD)
 
+    # Should anything below hang, in the middleware say, the process ends all the same, and the log shows where it was.
+    faulthandler.dump_traceback_later(_LEAVE_TIMEOUT, exit=True)
     session = node.session
     if session and not session.stop(_STOP_TIMEOUT):
         node.get_logger().warning("the running localization did not end in time")
