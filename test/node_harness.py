@@ -166,31 +166,15 @@ class Diagnostic:
         return self.level == DiagnosticStatus.OK
 
 
-class Client:
-    """A camera and a robot's state estimator, as the localizer sees them, that remember what it published."""
+class SpunNode:
+    """A node in a context of its own, whose messages are taken while somebody waits for something."""
 
-    def __init__(self, name: str = "client", transport: str = "raw") -> None:
-        self.poses: dict[str, PoseWithCovarianceStamped] = {}
-        self.renders: list[Image] = []
-        self.diagnostics: list[Diagnostic] = []
-        # What the localizer said of its health, and of its map.
-        self.health: list[Diagnostic] = []
-        self.maps: list[Diagnostic] = []
-        self._publishers: dict[str, rclpy.publisher.Publisher] = {}
+    def __init__(self, name: str) -> None:
         self._context = rclpy.Context()
         rclpy.init(context=self._context)
         self.node = rclpy.create_node(name, context=self._context)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self.node)
-        image = (Image, "image") if transport == "raw" else (CompressedImage, "image/compressed")
-        self._image = self.node.create_publisher(*image, 5)
-        self._camera_info = self.node.create_publisher(CameraInfo, "camera_info", 5)
-        self._prior = self.node.create_publisher(PoseStamped, "prior", 5)
-        self._prior_with_covariance = self.node.create_publisher(PoseWithCovarianceStamped, "prior_with_covariance", 5)
-        latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        self.node.create_subscription(PoseWithCovarianceStamped, "pose", self._on_pose, latched)
-        self.node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 100)
-        self._relocalize = self.node.create_client(Trigger, "localizer/relocalize")
 
     def close(self) -> None:
         self._executor.shutdown()
@@ -208,6 +192,29 @@ class Client:
 
     def spin(self, seconds: float) -> None:
         self.spin_until(lambda: False, seconds)
+
+
+class Client(SpunNode):
+    """A camera and a robot's state estimator, as the localizer sees them, that remember what it published."""
+
+    def __init__(self, name: str = "client", transport: str = "raw") -> None:
+        super().__init__(name)
+        self.poses: dict[str, PoseWithCovarianceStamped] = {}
+        self.renders: list[Image] = []
+        self.diagnostics: list[Diagnostic] = []
+        # What the localizer said of its health, and of its map.
+        self.health: list[Diagnostic] = []
+        self.maps: list[Diagnostic] = []
+        self._publishers: dict[str, rclpy.publisher.Publisher] = {}
+        image = (Image, "image") if transport == "raw" else (CompressedImage, "image/compressed")
+        self._image = self.node.create_publisher(*image, 5)
+        self._camera_info = self.node.create_publisher(CameraInfo, "camera_info", 5)
+        self._prior = self.node.create_publisher(PoseStamped, "prior", 5)
+        self._prior_with_covariance = self.node.create_publisher(PoseWithCovarianceStamped, "prior_with_covariance", 5)
+        latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self.node.create_subscription(PoseWithCovarianceStamped, "pose", self._on_pose, latched)
+        self.node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 100)
+        self._relocalize = self.node.create_client(Trigger, "localizer/relocalize")
 
     def connect(self) -> None:
         """Wait until the localizer and this client have found each other."""

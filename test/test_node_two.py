@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from node_harness import (
@@ -16,6 +14,7 @@ from node_harness import (
     START_TIMEOUT,
     TIMEOUT,
     NodeProcess,
+    SpunNode,
     info_of,
     matrix_of,
     node_arguments,
@@ -23,7 +22,6 @@ from node_harness import (
     rgb_image,
     text,
 )
-from rclpy.executors import SingleThreadedExecutor
 from sensor_msgs.msg import CameraInfo, Image
 from std_srvs.srv import Trigger
 
@@ -51,18 +49,15 @@ def localizer(name: str, map_file: Path) -> NodeProcess:
     return NodeProcess(*node_arguments(**parameters), "-r", f"__ns:=/{name}")
 
 
-class Robots:
+class Robots(SpunNode):
     """The robots of both namespaces, and what the localizers say to them."""
 
     def __init__(self) -> None:
+        super().__init__("robots")
         self.poses: dict[str, dict[str, PoseWithCovarianceStamped]] = {name: {} for name in ALIGNMENTS}
         # By the name of the status: the stamps of images and how they were answered.
         self.statuses: dict[str, dict[str, str]] = {}
-        self._context = rclpy.Context()
-        rclpy.init(context=self._context)
-        self._node = node = rclpy.create_node("robots", context=self._context)
-        self._executor = SingleThreadedExecutor(context=self._context)
-        self._executor.add_node(node)
+        node = self.node
         node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 100)
         types = {"image": Image, "camera_info": CameraInfo, "prior": PoseStamped}
         self._publishers = {
@@ -79,34 +74,17 @@ class Robots:
                 10,
             )
 
-    def close(self) -> None:
-        self._executor.shutdown()
-        self._node.destroy_node()
-        rclpy.shutdown(context=self._context)
-
     def connect(self) -> None:
         """Wait until the localizers and this node have found each other."""
         found = self.spin_until(
             lambda: (
                 all(publisher.get_subscription_count() for publisher in self._publishers.values())
                 and all(service.service_is_ready() for service in self._services.values())
-                and all(self._node.count_publishers(f"/{name}/pose") for name in ALIGNMENTS)
-                and self._node.count_publishers("/diagnostics") == len(ALIGNMENTS)
+                and all(self.node.count_publishers(f"/{name}/pose") for name in ALIGNMENTS)
+                and self.node.count_publishers("/diagnostics") == len(ALIGNMENTS)
             )
         )
         assert found, "the localizers were not discovered"
-
-    def spin_until(self, condition: Callable[[], bool], timeout: float = TIMEOUT) -> bool:
-        """Take messages until the condition holds; False when it does not within the timeout."""
-        deadline = time.monotonic() + timeout
-        while not condition():
-            if time.monotonic() > deadline:
-                return False
-            self._executor.spin_once(timeout_sec=0.05)
-        return True
-
-    def spin(self, seconds: float) -> None:
-        self.spin_until(lambda: False, seconds)
 
     def send(self, name: str, topic: str, message: object) -> None:
         self._publishers[name, topic].publish(message)
