@@ -80,6 +80,14 @@ def test_splat_reads_back(tmp_path, count, seed):
     assert_rotations_agree(read.rotations, written.rotations, 1.0)
 
 
+@pytest.mark.parametrize("beginning", [b"{", b"{\n", b'{"', b"PK", b"\x1f\x8b"])
+def test_splat_may_begin_as_other_formats_do(tmp_path, beginning):
+    """Its first bytes are a coordinate: of a random one, one in 256 begins with {."""
+    path = write_splat(tmp_path / "map", sample_map(5, 0, 0))
+    path.write_bytes(beginning + path.read_bytes()[len(beginning) :])
+    assert len(load_map(path)) == 5
+
+
 @pytest.mark.parametrize("version", [1, 2, 3, 4])
 @same_folder
 @given(count=counts, degree=degrees, seed=seeds)
@@ -441,7 +449,7 @@ def test_webp_that_is_lossy(tmp_path, channels):
 
 
 def test_files_larger_than_any_map(tmp_path):
-    for name, head, size in (("map.spz", b"NGSP", 66 * MAX_GAUSSIANS), ("meta.json", b"{", 1 << 30)):
+    for name, head, size in (("map.spz", b"NGSP", 66 * MAX_GAUSSIANS), ("meta.json", b"{" + 64 * b" ", 1 << 30)):
         with (tmp_path / name).open("wb") as stream:
             stream.write(head)
             stream.truncate(size)  # a file of holes

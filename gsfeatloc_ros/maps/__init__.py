@@ -16,14 +16,15 @@ from gsfeatloc_ros.maps.spz import read_spz
 
 __all__ = ["GaussianMap", "MapError", "Similarity", "load_map", "read_dataparser_transforms"]
 
-# How the files of each format begin. A .splat begins with its first Gaussian.
+# How the files of each format begin. A .splat begins with its first Gaussian, which may be any bytes, { for example.
 _MAGICS = (
     (b"ply", read_ply),
     (b"NGSP", read_spz),
-    (b"\x1f\x8b", read_spz),
-    (b"PK", read_sog),
-    (b"{", read_unbundled_sog),
+    (b"\x1f\x8b\x08", read_spz),
+    (b"PK\x03\x04", read_sog),
+    (b"PK\x05\x06", read_sog),  # an empty one
 )
+_HEAD_BYTES = 64
 
 
 def load_map(path: str | Path, alignment: Similarity | None = None) -> GaussianMap:
@@ -53,7 +54,9 @@ def _reader(path: Path) -> Callable[[Path], GaussianMap]:
     if path.exists() and not path.is_file():  # opening a pipe would wait for its writer
         raise MapError(f"{path}: is not a file")
     with path.open("rb") as stream:
-        head = stream.read(4)
+        head = stream.read(_HEAD_BYTES)
     if not head:
         raise MapError(f"{path}: is an empty file")
+    if head.startswith(b"{") and head.isascii() and b"\0" not in head:
+        return read_unbundled_sog
     return next((reader for magic, reader in _MAGICS if head.startswith(magic)), read_splat)
