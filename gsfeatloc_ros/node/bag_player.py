@@ -23,6 +23,8 @@ from gsfeatloc_ros.node.diagnostics import stamp_text
 # Seconds from a photo's prior and camera info to the photo itself: topics have no order, and it must not overtake them.
 # (To wait for their acknowledgment would take seconds: it comes with Fast DDS's heartbeat.)
 _HEAD_START = 0.1
+# Seconds that the localizer may need to find the player after the player has found it.
+_SETTLING = 0.5
 
 
 @dataclass(frozen=True)
@@ -122,6 +124,8 @@ class _Player:
         )
         if not found:
             raise TimeoutError(f"no localizer on {', '.join(self.publishers)} within {timeout:g} s")
+        # It may take a moment longer to find us, and would miss the first camera info: that is sent with best effort.
+        time.sleep(_SETTLING)
 
     def ask(self, cdr: bytes, timeout: float) -> Answer:
         """Publish a serialized photo and wait for what the localizer says to it."""
