@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
-from rclpy.qos import QoSProfile
 
 from gsfeatloc_ros.estimate import Estimate
+from gsfeatloc_ros.node.qos import RELIABLE
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 
@@ -54,7 +54,7 @@ class Reporter:
 
     def __init__(self, node: Node) -> None:
         self._node = node
-        self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", QoSProfile(depth=10))
+        self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", RELIABLE)
         self._next_complaint: dict[str, float] = {}
 
     def complain(self, subject: str, reason: str) -> bool:

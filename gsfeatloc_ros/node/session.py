@@ -6,6 +6,7 @@ import traceback
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import rclpy.task
@@ -133,7 +134,7 @@ class Session:
         """Listen."""
 
         def listen(message_type: type, topic: str, callback: Callable[[Any], None], qos: Any) -> None:
-            complain = lambda reason: self._refuse(f"qos of {topic}", reason, None)  # noqa: E731
+            complain = partial(self._refuse, f"qos of {topic}")
             self._subscriptions.append(subscribe(self._node, message_type, topic, callback, qos, complain))
 
         listen(self._image_type, self._image_topic if self._compressed else "image", self._on_image, NEWEST)
@@ -236,8 +237,7 @@ class Session:
         self._prior_pending = self._take("prior", self._inputs.take_prior, message)
 
     def _on_initial_pose(self, message: PoseWithCovarianceStamped) -> None:
-        take = lambda message: self._inputs.take_prior(message, "initialpose")  # noqa: E731
-        self._prior_pending = self._take("initialpose", take, message)
+        self._prior_pending = self._take("initialpose", partial(self._inputs.take_prior, name="initialpose"), message)
 
     def _on_odometry(self, message: Odometry) -> None:
         self._take("odom", self._inputs.take_odometry, message)
@@ -350,7 +350,7 @@ class Session:
 
     # Words, from either thread.
 
-    def _refuse(self, subject: str, reason: str, stamp: Time | None) -> None:
+    def _refuse(self, subject: str, reason: str, stamp: Time | None = None) -> None:
         """Say what is wrong with what came on a topic, not more often than is useful."""
         if self._reporter.complain(subject, reason):
             self._diagnose(ERROR, "refused", reason, {"stamp": stamp_text(stamp)} if stamp else {})

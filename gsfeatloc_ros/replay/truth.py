@@ -7,7 +7,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from gsfeatloc_ros.geometry import make_pose, so3_exp, so3_log
+from gsfeatloc_ros.geometry import interpolate
 
 # Between poses farther apart than this many seconds the truth is not known.
 MAX_GAP = 0.25
@@ -44,7 +44,5 @@ class Trajectory:
             return self._poses[after]
         if after in (0, len(self)) or self._stamps[after] - self._stamps[after - 1] > 1e9 * MAX_GAP:
             return None
-        first, last = self._poses[after - 1], self._poses[after]
         share = (stamp - self._stamps[after - 1]) / (self._stamps[after] - self._stamps[after - 1])
-        rotation = first[:3, :3] @ so3_exp(share * so3_log(first[:3, :3].T @ last[:3, :3]))
-        return make_pose(rotation, (1 - share) * first[:3, 3] + share * last[:3, 3])
+        return interpolate(self._poses[after - 1], self._poses[after], share)
