@@ -25,7 +25,8 @@ CAUCHY_SCALE = 1.0
 # error of this many pixels that all share. Fitted on real photos; docs/trust.md.
 _SHARED_PIXEL_SIGMA = 0.1
 _NOISE_ITERATIONS = 5
-_CONVERGED = 1e-10
+# A step that lowers the cost by less than this share ends the refinement: a thousandth of a standard deviation is left.
+_CONVERGED = 1e-7
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,7 +167,8 @@ def refine_pose(
     weights = _cauchy_weights(squared)
     degrees_of_freedom = max(2 * weights.sum() - 6, 1.0)
     inflation = max((weights * squared).sum() / degrees_of_freedom, 1.0)
-    information_of_a_match = np.einsum("m,mri,mrj->ij", weights, jacobian, jacobian) / weights.sum()
+    weighted = (weights[:, None, None] * jacobian).reshape(-1, 6)
+    information_of_a_match = weighted.T @ jacobian.reshape(-1, 6) / weights.sum()
     shared = _SHARED_PIXEL_SIGMA**2 * np.linalg.inv(information_of_a_match)
     return pose, covariance * inflation + shared
 
@@ -176,23 +178,19 @@ def _linearize(camera: Camera, pose: np.ndarray, pixels: np.ndarray, points: np.
 
     The pose moves as t + dt, exp(dr) R, both in the map frame. All None where a point is not ahead of the camera.
     """
-    R_camera_map = pose[:3, :3].T
     offsets = points - pose[:3, 3]
-    x, y, z = (offsets @ R_camera_map.T).T
+    in_camera = offsets @ pose[:3, :3]
+    z = in_camera[:, 2:]
     if not (z > 0).all():
         return None, None, None
-    fx, fy, skewness = camera.K[0, 0], camera.K[1, 1], camera.K[0, 1]
-    zero = np.zeros_like(z)
-    by_camera_point = np.stack(
-        [
-            np.stack([fx / z, skewness / z, -(fx * x + skewness * y) / z**2], axis=1),
-            np.stack([zero, fy / z, -fy * y / z**2], axis=1),
-        ],
-        axis=1,
-    )
-    by_point = by_camera_point @ R_camera_map
-    residuals = camera.project(np.stack([x, y, z], axis=1)) - pixels
-    return residuals, np.concatenate([-by_point, by_point @ skew(offsets)], axis=2), by_point
+    homogeneous = in_camera @ camera.K.T
+    # The quotient rule, for u and v: (K_r - pixel e_z) / z.
+    by_camera_point = camera.K[:2] / z[..., None]
+    projected = homogeneous[:, :2] / z
+    by_camera_point[:, :, 2] -= projected / z
+    by_point = by_camera_point @ pose[:3, :3].T
+    jacobian = np.concatenate([-by_point, by_point @ skew(offsets)], axis=2)
+    return projected - pixels, jacobian, by_point
 
 
 def _normal_equations(whitening: np.ndarray, residuals: np.ndarray, jacobian: np.ndarray):
@@ -200,8 +198,8 @@ def _normal_equations(whitening: np.ndarray, residuals: np.ndarray, jacobian: np
     white_residuals = _apply(whitening, residuals)
     white_jacobian = whitening @ jacobian
     weights = _cauchy_weights((white_residuals**2).sum(axis=1))
-    weighted = white_jacobian * weights[:, None, None]
-    return np.einsum("mri,mrj->ij", weighted, white_jacobian), np.einsum("mri,mr->i", weighted, white_residuals)
+    weighted = (white_jacobian * weights[:, None, None]).reshape(-1, 6)
+    return weighted.T @ white_jacobian.reshape(-1, 6), weighted.T @ white_residuals.ravel()
 
 
 def _cauchy_weights(squared: np.ndarray) -> np.ndarray:
@@ -213,15 +211,18 @@ def _whitening(residuals: np.ndarray, smears: np.ndarray) -> np.ndarray:
     """Matrices W (M, 2, 2) with W^T W the inverse covariances of the residuals (M, 2).
 
     A covariance is the smear (M, 2) of the point's uncertainty, in pixels, and the keypoints' noise, which is chosen so
-    that the median whitened residual is as long as a Gaussian's.
+    that the median whitened residual is as long as a Gaussian's. W shortens what lies along the smear.
     """
     smear_covariances = smears[:, :, None] * smears[:, None, :]
+    squares = (smears**2).sum(axis=1)
     # Of a 2D Gaussian, the median of the squared length is 2 ln 2 variances.
     median_of_unit = 2 * np.log(2)
     noise = np.median((residuals**2).sum(axis=1)) / median_of_unit
     for _ in range(_NOISE_ITERATIONS):
         noise = max(noise, _MIN_PIXEL_SIGMA**2)
-        whitening = np.linalg.inv(np.linalg.cholesky(noise * np.eye(2) + smear_covariances))
+        # The inverse square root of noise * I + smear smear^T.
+        along = (1.0 - np.sqrt(noise / (noise + squares))) / np.maximum(squares, np.finfo(float).tiny)
+        whitening = (np.eye(2) - along[:, None, None] * smear_covariances) / np.sqrt(noise)
         noise *= np.median((_apply(whitening, residuals) ** 2).sum(axis=1)) / median_of_unit
     return whitening
 
