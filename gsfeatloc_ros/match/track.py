@@ -11,20 +11,20 @@ from gsfeatloc_ros.structure import local_structure
 
 # Corners (Shi and Tomasi, 1994): at most this many, at least so many pixels apart, and of at least this share of the
 # strongest one's strength.
-_MAX_CORNERS = 800
-_DISTANCE = 7
-_QUALITY = 0.005
-_CORNER_BLOCK = 5
+MAX_CORNERS = 800
+DISTANCE = 7
+QUALITY = 0.005
+CORNER_BLOCK = 5
 # The images that are compared: local structure, its zero in the middle of the range of a byte.
-_NEIGHBOURHOOD = 12.0
-_MIN_CONTRAST = 8.0
-_GAIN = 40.0
+NEIGHBOURHOOD = 12.0
+MIN_CONTRAST = 8.0
+GAIN = 40.0
 # Lucas-Kanade on a pyramid of four levels.
-_WINDOW = (15, 15)
-_LEVELS = 3
+WINDOW = (15, 15)
+LEVELS = 3
 _CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.01)
 # A corner that is followed to the render and back must return to within this many pixels.
-_MAX_RETURN_ERROR = 1.0
+MAX_RETURN_ERROR = 1.0
 
 
 class CornerTracker:
@@ -41,9 +41,8 @@ class CornerTracker:
     def __init__(self, photo: Photo) -> None:
         gray = photo.gray()
         self._structure = _structure(gray)
-        # Away from where the lens saw nothing: the border of that is no corner of the world.
-        mask = cv2.erode(photo.seen.astype(np.uint8), np.ones(_WINDOW, np.uint8))
-        corners = cv2.goodFeaturesToTrack(gray, _MAX_CORNERS, _QUALITY, _DISTANCE, mask=mask, blockSize=_CORNER_BLOCK)
+        mask = seen_off_the_border(photo)
+        corners = cv2.goodFeaturesToTrack(gray, MAX_CORNERS, QUALITY, DISTANCE, mask=mask, blockSize=CORNER_BLOCK)
         self.corners = np.empty((0, 2), np.float32) if corners is None else corners.reshape(-1, 2)
 
     def track(self, image: np.ndarray) -> Matches:
@@ -56,19 +55,24 @@ class CornerTracker:
         structure = _structure(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
         there, found = _flow(self._structure, structure, self.corners)
         back, found_back = _flow(structure, self._structure, there)
-        kept = found & found_back & (np.linalg.norm(back - self.corners, axis=1) <= _MAX_RETURN_ERROR)
+        kept = found & found_back & (np.linalg.norm(back - self.corners, axis=1) <= MAX_RETURN_ERROR)
         pixels = self.corners[kept].astype(np.float64)
         return Matches(pixels, there[kept].astype(np.float64), np.ones(len(pixels)))
 
 
+def seen_off_the_border(photo: Photo) -> np.ndarray:
+    """Where corners are looked for, (H, W) uint8: the border of what the lens saw is no corner of the world."""
+    return cv2.erode(photo.seen.astype(np.uint8), np.ones(WINDOW, np.uint8))
+
+
 def _structure(gray: np.ndarray) -> np.ndarray:
-    structure, _ = local_structure(gray, _NEIGHBOURHOOD, _MIN_CONTRAST)
-    return np.clip(128 + _GAIN * structure, 0, 255).astype(np.uint8)
+    structure, _ = local_structure(gray, NEIGHBOURHOOD, MIN_CONTRAST)
+    return np.clip(128 + GAIN * structure, 0, 255).astype(np.uint8)
 
 
 def _flow(here: np.ndarray, there: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Where pixels (N, 2) of one image are in another: (N, 2), and which were found (N,) bool."""
     moved, found, _ = cv2.calcOpticalFlowPyrLK(
-        here, there, pixels, None, winSize=_WINDOW, maxLevel=_LEVELS, criteria=_CRITERIA
+        here, there, pixels, None, winSize=WINDOW, maxLevel=LEVELS, criteria=_CRITERIA
     )
     return moved, found[:, 0] == 1

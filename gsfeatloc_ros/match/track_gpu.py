@@ -1,0 +1,270 @@
+"""Following the corners of a photo into renders that lie on a GPU."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from torch.nn.functional import avg_pool2d, conv2d, grid_sample, max_pool2d, pad
+
+from gsfeatloc_ros.arrays import Array
+from gsfeatloc_ros.match.base import Matches
+from gsfeatloc_ros.match.track import (
+    CORNER_BLOCK,
+    DISTANCE,
+    GAIN,
+    LEVELS,
+    MAX_CORNERS,
+    MAX_RETURN_ERROR,
+    MIN_CONTRAST,
+    NEIGHBOURHOOD,
+    QUALITY,
+    WINDOW,
+    seen_off_the_border,
+)
+from gsfeatloc_ros.photo import Photo
+
+# Peaks that are looked at for corners. There is about one in 25 pixels, a corner needs 50 to 80 for itself.
+_CANDIDATES = 4 * MAX_CORNERS
+# How often it is decided which of them are corners. Odd, so that none of those left undecided is taken.
+_ROUNDS = 9
+# Steps on the coarsest level, where the way is long, and on each other.
+_COARSEST_STEPS = 25
+_STEPS = 12
+# Share of each step that is taken: in an image of twice the contrast, whole ones would lead to and fro for ever.
+_DAMPING = 0.75
+# Structure, of 255, beyond which the bytes of CornerTracker have no values.
+_MOST = 128.0
+# OpenCV's 1e-4, which it compares with a 1024th of the mean of the squared gradients.
+_MIN_EIGENVALUE = 0.1024
+_LUMA = (0.299, 0.587, 0.114)
+# Smoothing across and derivative along an axis.
+_SOBEL = ((1, 2, 1), (-1, 0, 1))
+_SCHARR = ((3 / 16, 10 / 16, 3 / 16), (-1 / 2, 0, 1 / 2))
+_HALVING = np.array([1, 4, 6, 4, 1]) / 16
+
+
+class GpuCornerTracker:
+    """CornerTracker on a device of torch's, for renders that lie there; only what is found comes to the host.
+
+    It finds the same to some hundredths of a pixel: local structure is not rounded to bytes here, and all corners take
+    the same number of smaller steps. (Bicubic interpolation, torch's with a = -0.75, would be worse than bilinear: it
+    is biased towards whole pixels, by up to 0.03.)
+
+    Attributes:
+        corners: (N, 2) float32 pixels of the photo.
+    """
+
+    def __init__(self, photo: Photo, device: str) -> None:
+        self._constants = _constants(*photo.seen.shape, device)
+        with torch.inference_mode():
+            gray = self._constants.gray(photo.image)
+            seen = self._constants.to_device(seen_off_the_border(photo))
+            self.corners = _find_corners(gray, seen, self._constants.sobel)
+            if len(self.corners) > 0:
+                self._pixels = self._constants.to_device(self.corners)
+                self._pyramid = self._constants.pyramid(gray)
+                self._templates = [level.templates(self._pixels) for level in self._pyramid]
+
+    @torch.inference_mode()
+    def track(self, image: Array) -> Matches:
+        """Find the photo's corners in a render (H, W, 3) uint8 RGB of its size.
+
+        Corners that cannot be followed there and back are left out.
+        """
+        if len(self.corners) == 0:
+            return Matches.none()
+        pyramid = self._constants.pyramid(self._constants.gray(image))
+        last_pixel = self._constants.last_pixel
+        there, found = _flow(self._templates, pyramid, self._pixels, last_pixel)
+        back, found_back = _flow([level.templates(there) for level in pyramid], self._pyramid, there, last_pixel)
+        kept = found & found_back & ((back - self._pixels).norm(dim=1) <= MAX_RETURN_ERROR)
+        # One copy, as each waits for the device.
+        x, y, kept = torch.cat([there, kept[:, None]], dim=1).cpu().numpy().T
+        kept = kept > 0
+        pixels = self.corners[kept].astype(np.float64)
+        return Matches(pixels, np.column_stack([x, y])[kept].astype(np.float64), np.ones(len(pixels)))
+
+
+def _flow(
+    templates: list[_Templates], pyramid: list[_Level], pixels: torch.Tensor, last_pixel: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Where `templates` of the pixels (N, 2) of one image are in another: (N, 2), and which were found (N,) bool.
+
+    By the iteration of Lucas and Kanade, from the coarsest level to the finest. All corners take the same number of
+    steps: those that are there stay, and the host need not ask the device which they are.
+    """
+    moved = pixels
+    for level, template in reversed(list(zip(pyramid, templates, strict=True))):
+        for _ in range(_COARSEST_STEPS if level is pyramid[-1] else _STEPS):
+            difference = template.values - level.values(moved)
+            moved = torch.baddbmm(moved[..., None], template.steps, difference[..., None], alpha=_DAMPING)[..., 0]
+    inside = ((moved >= 0) & (moved <= last_pixel)).all(dim=1)
+    return moved, inside & templates[0].textured
+
+
+def _find_corners(gray: torch.Tensor, seen: torch.Tensor, sobel: torch.Tensor) -> np.ndarray:
+    """The strongest corners (N, 2) float32 of brightness (H, W) where `seen` (H, W), as goodFeaturesToTrack's."""
+    gx, gy = _filtered(gray, sobel)[0]
+    around = pad(torch.stack([gx * gx, gx * gy, gy * gy])[None], [CORNER_BLOCK // 2] * 4, mode="replicate")
+    strength = _least_eigenvalue(*avg_pool2d(around, CORNER_BLOCK, 1)[0]) * seen
+    # On the border there is no peak.
+    highest = max_pool2d(pad(strength, (1, 1, 1, 1), value=torch.inf)[None], 3, 1)[0]
+    peaks = (strength * (strength == highest)).flatten()
+    strengths, indices = peaks.topk(min(_CANDIDATES, len(peaks)))
+    width = gray.shape[1]
+    pixels = torch.stack([indices % width, indices // width], dim=1).float()
+    strong = strengths > QUALITY * strengths[0]
+
+    # A candidate is a corner unless a stronger corner is near: known at once of those that are the strongest around, of
+    # others when it is known of those.
+    near = torch.cdist(pixels, pixels, compute_mode="donot_use_mm_for_euclid_dist") < DISTANCE
+    ruled_out_by = near.tril(-1).float()
+    corners = strong
+    for _ in range(_ROUNDS):
+        corners = strong & (ruled_out_by @ corners.float() == 0)
+    x, y, corners = torch.cat([pixels, corners[:, None]], dim=1).cpu().numpy().T
+    return np.column_stack([x, y])[corners > 0][:MAX_CORNERS]
+
+
+@dataclass(frozen=True, eq=False)
+class _Templates:
+    """What the surroundings of N corners look like on a level of the pyramid.
+
+    Attributes:
+        values: (N, P) of the P pixels of a window.
+        steps: (N, 2, P) pixels of the whole image that the corner moves by where a value is less by 1: the inverse of
+            the gradient's second moments, times the gradient. Zeros without texture.
+        textured: (N,) bool, whether there is gradient in all directions.
+    """
+
+    values: torch.Tensor
+    steps: torch.Tensor
+    textured: torch.Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class _Scale:
+    """The coordinates of a level of the pyramid as grid_sample takes them: the outermost pixels' centres are -1 and 1.
+
+    Attributes:
+        pixel: of this level, in pixels of the whole image.
+        window: (P, 2) where a window's pixels are when its middle is at the image's first pixel.
+        per_pixel: (2,) what a pixel of the whole image is.
+    """
+
+    pixel: int
+    window: torch.Tensor
+    per_pixel: torch.Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class _Level:
+    """A level of the pyramid: structure (1, 1, H, W) and its gradient (1, 2, H, W)."""
+
+    structure: torch.Tensor
+    gradient: torch.Tensor
+    scale: _Scale
+
+    def values(self, pixels: torch.Tensor) -> torch.Tensor:
+        """The windows (N, P) round `pixels` (N, 2) of the whole image; outside, the level is reflected."""
+        grid = self._grid(pixels)
+        return grid_sample(self.structure, grid, padding_mode="reflection", align_corners=True)[0, 0]
+
+    def templates(self, pixels: torch.Tensor) -> _Templates:
+        """The windows round `pixels` (N, 2) of the whole image, ready to be followed; outside there is no gradient."""
+        gradient = grid_sample(self.gradient, self._grid(pixels), align_corners=True)[0].transpose(0, 1)
+        (xx, xy), (_, yy) = (gradient @ gradient.mT / gradient.shape[2]).permute(1, 2, 0)
+        textured = _least_eigenvalue(xx, xy, yy) >= _MIN_EIGENVALUE
+        share = self.scale.pixel / gradient.shape[2] * textured
+        inverse = torch.stack([yy, -xy, -xy, xx]) * (share / (xx * yy - xy * xy).clamp(min=_MIN_EIGENVALUE**2))
+        return _Templates(self.values(pixels), inverse.view(2, 2, -1).permute(2, 0, 1) @ gradient, textured)
+
+    def _grid(self, pixels: torch.Tensor) -> torch.Tensor:
+        return torch.addcmul(self.scale.window, pixels[:, None], self.scale.per_pixel)[None]
+
+
+class _Constants:
+    """What does not change between pictures of a size, on a device."""
+
+    def __init__(self, height: int, width: int, device: str) -> None:
+        self._device = device
+        self._luma = self._tensor(_LUMA)
+        self.sobel, self._scharr = (self._gradient_kernels(*kernels) for kernels in (_SOBEL, _SCHARR))
+        self.last_pixel = self._tensor([width - 1, height - 1])
+        # As matrices: two products of them are all that a separable filter takes, be it as wide as this one.
+        gaussian = cv2.getGaussianKernel(int(8 * NEIGHBOURHOOD) + 1, NEIGHBOURHOOD)[:, 0]
+        self._smoothing = self._filter(height, width, gaussian, 1)
+        self._scales = [self._scale(height, width, 1)]
+        self._halvings = []
+        # The coarsest level is larger than the window, as OpenCV's.
+        while len(self._scales) <= LEVELS and (height + 1) // 2 > WINDOW[1] and (width + 1) // 2 > WINDOW[0]:
+            self._halvings.append(self._filter(height, width, _HALVING, 2))
+            height, width = (height + 1) // 2, (width + 1) // 2
+            self._scales.append(self._scale(height, width, 2 ** len(self._scales)))
+
+    def to_device(self, array: Array) -> torch.Tensor:
+        # The host goes on while it is copied; torch has read arrays that are not pinned when it returns.
+        return torch.as_tensor(array).to(self._device, non_blocking=True)
+
+    def gray(self, image: Array) -> torch.Tensor:
+        """Brightness (H, W), whole numbers as OpenCV's, of an RGB image (H, W, 3) uint8."""
+        return (self.to_device(image).float() @ self._luma).round()
+
+    def pyramid(self, gray: torch.Tensor) -> list[_Level]:
+        """The local structure (structure.py) of brightness (H, W), and its halvings."""
+        rows, columns = self._smoothing
+        centred = gray - rows @ gray @ columns
+        contrast = (rows @ centred.square() @ columns).sqrt()
+        images = [(GAIN * centred / contrast.clamp(min=MIN_CONTRAST)).clamp(-_MOST, _MOST)]
+        for rows, columns in self._halvings:
+            images.append(rows @ images[-1] @ columns)
+        return [
+            _Level(image[None, None], _filtered(image, self._scharr), scale)
+            for image, scale in zip(images, self._scales, strict=True)
+        ]
+
+    def _tensor(self, array: object) -> torch.Tensor:
+        return torch.tensor(np.asarray(array), dtype=torch.float32, device=self._device)
+
+    def _gradient_kernels(self, smoothing: Sequence[float], derivative: Sequence[float]) -> torch.Tensor:
+        return self._tensor([[np.outer(smoothing, derivative)], [np.outer(derivative, smoothing)]])
+
+    def _filter(self, height: int, width: int, kernel: np.ndarray, stride: int) -> tuple[torch.Tensor, torch.Tensor]:
+        """What an image is multiplied with from the left and from the right to be filtered both ways."""
+        rows, columns = (_filter_matrix(size, kernel, stride) for size in (height, width))
+        return self._tensor(rows), self._tensor(columns.T)
+
+    def _scale(self, height: int, width: int, pixel: int) -> _Scale:
+        x, y = np.meshgrid(*(np.arange(size) - size // 2 for size in WINDOW))
+        unit = 2 / np.maximum([width - 1, height - 1], 1)
+        window = np.column_stack([x.ravel(), y.ravel()]) * unit - 1
+        return _Scale(pixel, self._tensor(window), self._tensor(unit / pixel))
+
+
+# Photos of a camera have one size.
+_constants = functools.lru_cache(maxsize=4)(_Constants)
+
+
+def _filter_matrix(size: int, kernel: np.ndarray, stride: int) -> np.ndarray:
+    """The matrix that filters `size` numbers, reflected at the ends, and keeps every `stride`-th."""
+    sources = np.pad(np.arange(size), len(kernel) // 2, mode="reflect")
+    targets = np.arange(0, size, stride)
+    matrix = np.zeros((len(targets), size))
+    for k, weight in enumerate(kernel):
+        np.add.at(matrix, (np.arange(len(targets)), sources[targets + k]), weight)
+    return matrix
+
+
+def _filtered(image: torch.Tensor, kernels: torch.Tensor) -> torch.Tensor:
+    """An image (H, W) filtered with each of the K 3x3 kernels (K, 1, 3, 3): (1, K, H, W)."""
+    return conv2d(pad(image[None, None], (1, 1, 1, 1), mode="replicate"), kernels)
+
+
+def _least_eigenvalue(xx: torch.Tensor, xy: torch.Tensor, yy: torch.Tensor) -> torch.Tensor:
+    """Of the symmetric matrices [[xx, xy], [xy, yy]]."""
+    return 0.5 * (xx + yy - torch.hypot(xx - yy, 2 * xy))
