@@ -9,8 +9,8 @@ from gsfeatloc_ros.match.base import Features, Matches
 from gsfeatloc_ros.match.nearest import match_mutual
 
 # Renders are smoother than photos: SIFT's usual threshold of 0.04 leaves too few features in them.
-_CONTRAST_THRESHOLD = 0.01
-_MAX_RATIO = 0.85
+CONTRAST_THRESHOLD = 0.01
+MAX_RATIO = 0.85
 
 
 class Sift:
@@ -19,7 +19,7 @@ class Sift:
     def __init__(self, max_features: int) -> None:
         # Precise upscaling: without it keypoints are a quarter of a pixel off.
         self._sift = cv2.SIFT_create(
-            nfeatures=max_features, contrastThreshold=_CONTRAST_THRESHOLD, enable_precise_upscale=True
+            nfeatures=max_features, contrastThreshold=CONTRAST_THRESHOLD, enable_precise_upscale=True
         )
 
     def features(self, image: np.ndarray) -> Features:
@@ -34,4 +34,4 @@ class Sift:
 
     def match(self, a: Features, b: Features) -> Matches:
         """Match the features of two images."""
-        return match_mutual(a, b, max_ratio=_MAX_RATIO)
+        return match_mutual(a, b, max_ratio=MAX_RATIO)
