@@ -11,8 +11,7 @@ import numpy as np
 from gsfeatloc_ros.camera import Camera
 from gsfeatloc_ros.estimate import Estimate, Status
 from gsfeatloc_ros.geometry import so3_log
-from gsfeatloc_ros.match.base import Matcher
-from gsfeatloc_ros.match.track import CornerTracker
+from gsfeatloc_ros.match import Matcher, Tracker, create_tracker
 from gsfeatloc_ros.photo import Photo
 from gsfeatloc_ros.pose.acceptance import agreeing_share, agreement, coverage
 from gsfeatloc_ros.render.base import Renderer
@@ -122,7 +121,7 @@ class Localizer:
         with clock.stage("prepare"):
             photo = Photo.undistorted(image, camera, self._options.max_image_width)
         prior = np.asarray(T_map_camera_prior, dtype=np.float64)
-        query = _Query(photo, prior, np.asarray(prior_covariance, dtype=np.float64), clock)
+        query = _Query(photo, prior, np.asarray(prior_covariance, dtype=np.float64), self._renderer.device, clock)
         return replace(self._search(query), milliseconds=clock.milliseconds())
 
     def _search(self, query: _Query) -> Estimate:
@@ -235,17 +234,19 @@ class Localizer:
 
 @dataclass(frozen=True, eq=False)
 class _Query:
-    """What is asked: a photo, a prior (4, 4) with its covariance (6, 6)."""
+    """What is asked: a photo, a prior (4, 4) with its covariance (6, 6); `device` is the renderer's."""
 
     photo: Photo
     prior: np.ndarray
     prior_covariance: np.ndarray
+    device: str
     clock: StageClock
 
     @cached_property
-    def tracker(self) -> CornerTracker:
+    def tracker(self) -> Tracker:
         """Of the photo; made when there is an estimate to track from."""
-        return CornerTracker(self.photo)
+        with self.clock.stage("track"):
+            return create_tracker(self.photo, self.device)
 
     def deviation(self, pose: np.ndarray, usual_covariance: np.ndarray) -> float:
         """Mahalanobis distance of a pose (4, 4) from the prior.

@@ -8,8 +8,7 @@ import numpy as np
 
 from gsfeatloc_ros.camera import Camera
 from gsfeatloc_ros.geometry import invert, transform
-from gsfeatloc_ros.match.base import Features, Matcher, Matches
-from gsfeatloc_ros.match.track import CornerTracker
+from gsfeatloc_ros.match.base import Features, Matcher, Matches, Tracker
 from gsfeatloc_ros.pose.lift import lift
 from gsfeatloc_ros.pose.solve import PoseSolution, solve_pose
 from gsfeatloc_ros.render.base import Render, Renderer
@@ -80,7 +79,7 @@ def match_view(
     with clock.stage("render"):
         render = renderer.render(camera, pose)
     with clock.stage("features"):
-        features = matcher.features(render.image())
+        features = matcher.features(render.device_image())
     with clock.stage("match"):
         matches = matcher.match(query, features)
     return _solve_view(render, matches, camera, pose, max_error, seed, clock)
@@ -88,7 +87,7 @@ def match_view(
 
 def track_view(
     renderer: Renderer,
-    tracker: CornerTracker,
+    tracker: Tracker,
     camera: Camera,
     pose: np.ndarray,
     max_error: float,
@@ -99,7 +98,7 @@ def track_view(
     with clock.stage("render"):
         render = renderer.render(camera, pose)
     with clock.stage("track"):
-        matches = tracker.track(render.image())
+        matches = tracker.track(render.device_image())
     return _solve_view(render, matches, camera, pose, max_error, seed, clock)
 
 

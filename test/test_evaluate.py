@@ -292,6 +292,7 @@ class GivenDepth:
             depth_std=np.zeros(shape, np.float32),
             alpha=np.ones(shape, np.float32),
         )
+        self.device = "cpu"
 
     def render(self, camera, T_map_camera):
         return self._render
@@ -506,7 +507,7 @@ def test_success_by_step():
 
 
 def pieces_in_place():
-    return (lift.MIN_ALPHA, lift.MAX_DEPTH_STEP, solve.CAUCHY_SCALE, localize.CornerTracker)
+    return (lift.MIN_ALPHA, lift.MAX_DEPTH_STEP, solve.CAUCHY_SCALE, localize.create_tracker)
 
 
 @pytest.mark.parametrize("piece", ["", *PIECES])

@@ -13,12 +13,17 @@ import subprocess
 import sys
 import threading
 from dataclasses import replace
+from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from types import ModuleType
 
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from stand_in.gpu import as_kernel, simulated_gpu
 from test_render import assert_same, concatenated, one_gaussian, psnr, random_map, small_camera
 
 from gsfeatloc_ros.geometry import make_pose, so3_exp
@@ -30,6 +35,7 @@ from gsfeatloc_ros.render.cpu import CpuRenderer
 from gsfeatloc_ros.render.gpu import GpuRenderer, self_check
 from gsfeatloc_ros.render.prepare import prepare
 from gsfeatloc_ros.render.reference import ReferenceRenderer
+from gsfeatloc_ros.render.slabs import Slabs
 
 STAND_IN = Path(__file__).parent / "stand_in" / "gsplat.py"
 POSE = make_pose(so3_exp(np.array([0.2, -0.3, 0.1])), np.array([0.3, -0.2, 0.5]))
@@ -72,7 +78,7 @@ def on_stand_in(gaussian_map: GaussianMap, **options) -> GpuRenderer:
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_asks_for_the_picture_that_the_reference_draws(gsplat, sh_degree: int, antialiased: bool) -> None:
     gaussian_map = replace(random_map(150, sh_degree, seed=sh_degree), antialiased=antialiased)
-    gpu = on_stand_in(gaussian_map, background=BACKGROUND).render(small_camera(), POSE)
+    gpu = on_stand_in(gaussian_map, background=BACKGROUND).render(small_camera(), POSE).on_host()
     reference = ReferenceRenderer(gaussian_map, BACKGROUND).render(small_camera(), POSE)
     assert_same(gpu, reference, 70)
     for image in (gpu.rgb, gpu.depth, gpu.median_depth, gpu.depth_std, gpu.alpha):
@@ -89,8 +95,8 @@ def test_a_map_moved_turned_and_scaled_looks_alike_and_its_depths_are_the_maps(g
     gaussian_map = random_map(300, 2, seed=3)
     S_map_splat = Similarity(2.5, so3_exp(np.array([0.4, 0.2, -1.0])), np.array([10.0, -4.0, 3.0]))
     moved = replace(gaussian_map, S_map_splat=S_map_splat)
-    here = on_stand_in(gaussian_map).render(small_camera(), POSE)
-    there = on_stand_in(moved).render(small_camera(), S_map_splat.transform_pose(POSE))
+    here = on_stand_in(gaussian_map).render(small_camera(), POSE).on_host()
+    there = on_stand_in(moved).render(small_camera(), S_map_splat.transform_pose(POSE)).on_host()
     assert psnr(here, there) > 70
     assert_same(there, ReferenceRenderer(moved).render(small_camera(), S_map_splat.transform_pose(POSE)), 70)
     np.testing.assert_allclose(there.depth, 2.5 * here.depth, rtol=1e-4)
@@ -103,7 +109,10 @@ def test_a_map_far_from_its_origin_loses_no_digits(gsplat) -> None:
     far = replace(near, means=near.means + np.float32([65536, -65536, 0]))
     pose = POSE.copy()
     pose[:3, 3] += [65536, -65536, 0]
-    a, b = on_stand_in(near).render(small_camera(), POSE), on_stand_in(far).render(small_camera(), pose)
+    a, b = (
+        on_stand_in(near).render(small_camera(), POSE).on_host(),
+        on_stand_in(far).render(small_camera(), pose).on_host(),
+    )
     assert psnr(a, b) > 70
 
 
@@ -111,14 +120,14 @@ def test_a_map_far_from_its_origin_loses_no_digits(gsplat) -> None:
 def test_harmonics_are_drawn_up_to_the_degree_asked_for(gsplat, sh_degree: int) -> None:
     gaussian_map = random_map(200, 2, seed=7)
     cut = replace(gaussian_map, sh=gaussian_map.sh[:, : SH_COEFFICIENTS[sh_degree]])
-    capped = on_stand_in(gaussian_map, sh_degree=sh_degree).render(small_camera(), np.eye(4))
-    np.testing.assert_array_equal(capped.rgb, on_stand_in(cut).render(small_camera(), np.eye(4)).rgb)
+    capped = on_stand_in(gaussian_map, sh_degree=sh_degree).render(small_camera(), np.eye(4)).on_host()
+    np.testing.assert_array_equal(capped.rgb, on_stand_in(cut).render(small_camera(), np.eye(4)).on_host().rgb)
 
 
 def test_median_depth_ignores_a_floater_that_drags_the_mean(gsplat) -> None:
     wall = one_gaussian((0, 0, 4.0), (30.0, 30.0, 1e-3), 0.99)
     floater = one_gaussian((0, 0, 1.0), (30.0, 30.0, 1e-3), 0.3)
-    render = on_stand_in(concatenated(wall, floater)).render(small_camera(), np.eye(4))
+    render = on_stand_in(concatenated(wall, floater)).render(small_camera(), np.eye(4)).on_host()
     middle = render.depth.shape[0] // 2, render.depth.shape[1] // 2
     assert render.median_depth[middle] == pytest.approx(4.0, abs=1e-3)
     assert render.depth[middle] < 3.2
@@ -127,8 +136,8 @@ def test_median_depth_ignores_a_floater_that_drags_the_mean(gsplat) -> None:
 def test_median_depth_is_close_to_the_exact_one(gsplat, room_map, room_queries) -> None:
     query = room_queries[0]
     camera = replace(small_camera(120, 90), K=np.array([[94.0, 0, 59.5], [0, 94.0, 44.5], [0, 0, 1]]))
-    estimate = on_stand_in(room_map).render(camera, query.T_map_camera)
-    exact = CpuRenderer(room_map).render(camera, query.T_map_camera)
+    estimate = on_stand_in(room_map).render(camera, query.T_map_camera).on_host()
+    exact = CpuRenderer(room_map).render(camera, query.T_map_camera).on_host()
     covered = exact.alpha > 0.8
     assert covered.mean() > 0.5
     error = np.abs(estimate.median_depth - exact.median_depth)[covered] / exact.median_depth[covered]
@@ -136,9 +145,25 @@ def test_median_depth_is_close_to_the_exact_one(gsplat, room_map, room_queries) 
     assert np.quantile(error, 0.95) < 0.03
 
 
+@given(st.integers(0, 10_000), st.integers(1, 40), st.sampled_from([1.0, 1e3, 1e9]))
+def test_median_depth_is_among_the_depths(seed: int, count: int, spread: float) -> None:
+    rng = np.random.default_rng(seed)
+    depths = torch.from_numpy(rng.uniform(1.0, 2.0, count) * spread ** rng.uniform(0, 1, count)).float()
+    weights = torch.from_numpy(rng.dirichlet(np.ones(count))).float()
+    slabs = Slabs.of(depths, torch.from_numpy(rng.integers(1, 500, count)))
+    median = slabs.statistics((weights @ slabs.channels(depths))[None, None])[1].item()
+    # Between the edges of the slab that holds the exact one.
+    order = depths.argsort()
+    exact = depths[order][(weights[order].cumsum(0) >= 0.5 - 1e-5).int().argmax()].item()
+    edges = [0.0, *slabs.edges.tolist(), np.inf]
+    assert any(
+        low <= median <= high and low <= 1.0001 * exact and exact <= 1.0001 * high for low, high in pairwise(edges)
+    )
+
+
 @pytest.mark.parametrize("gaussian_map", [random_map(0, 1, seed=0), one_gaussian((0, 0, -2), 0.1, 1.0)])
 def test_where_there_is_nothing_to_see_there_is_the_background(gsplat, gaussian_map) -> None:
-    render = on_stand_in(gaussian_map, background=BACKGROUND).render(small_camera(), np.eye(4))
+    render = on_stand_in(gaussian_map, background=BACKGROUND).render(small_camera(), np.eye(4)).on_host()
     np.testing.assert_array_equal(render.rgb, np.broadcast_to(np.float32(BACKGROUND), render.rgb.shape))
     np.testing.assert_array_equal(render.alpha, 0)
     assert np.isnan(render.depth).all()
@@ -148,20 +173,22 @@ def test_where_there_is_nothing_to_see_there_is_the_background(gsplat, gaussian_
 
 def test_a_prepared_map_and_a_smaller_picture_are_drawn_as_by_the_cpu(gsplat) -> None:
     gaussian_map = random_map(300, 1, seed=2)
-    whole = on_stand_in(gaussian_map).render(small_camera(), POSE)
-    np.testing.assert_array_equal(on_stand_in(prepare(gaussian_map)).render(small_camera(), POSE).rgb, whole.rgb)
-    small = on_stand_in(gaussian_map, resolution_scale=0.5).render(small_camera(), POSE)
-    assert psnr(small, CpuRenderer(gaussian_map, resolution_scale=0.5).render(small_camera(), POSE)) > 70
+    whole = on_stand_in(gaussian_map).render(small_camera(), POSE).on_host()
+    np.testing.assert_array_equal(
+        on_stand_in(prepare(gaussian_map)).render(small_camera(), POSE).on_host().rgb, whole.rgb
+    )
+    small = on_stand_in(gaussian_map, resolution_scale=0.5).render(small_camera(), POSE).on_host()
+    assert psnr(small, CpuRenderer(gaussian_map, resolution_scale=0.5).render(small_camera(), POSE).on_host()) > 70
 
 
 def test_threads_get_the_same_pictures(gsplat) -> None:
     renderer = on_stand_in(random_map(150, 1, seed=1))
     poses = [make_pose(so3_exp(np.array([0.0, 0.1 * k, 0.0])), np.zeros(3)) for k in range(4)]
-    alone = [renderer.render(small_camera(), pose) for pose in poses]
+    alone = [renderer.render(small_camera(), pose).on_host() for pose in poses]
     together = [None] * len(poses)
 
     def draw(k: int) -> None:
-        together[k] = renderer.render(small_camera(), poses[k])
+        together[k] = renderer.render(small_camera(), poses[k]).on_host()
 
     threads = [threading.Thread(target=draw, args=(k,)) for k in range(len(poses))]
     for thread in threads:
@@ -173,6 +200,21 @@ def test_threads_get_the_same_pictures(gsplat) -> None:
         np.testing.assert_array_equal(a.median_depth, b.median_depth)
 
 
+def test_a_render_is_made_and_stays_on_the_gpu(gsplat, monkeypatch) -> None:
+    for name in gsplat.__all__:
+        monkeypatch.setattr(gsplat, name, as_kernel(getattr(gsplat, name)))
+    gaussian_map = random_map(150, 1, seed=0)
+    with simulated_gpu() as gpu:
+        renderer = GpuRenderer(gaussian_map, device=gpu.device)
+        gpu.reset()
+        render = renderer.render(small_camera(), POSE)
+        assert not gpu.to_host
+        # Where the camera is goes there, and nobody waits.
+        assert not gpu.waits
+        assert 0 < sum(gpu.to_device) < 200
+        assert_same(render.on_host(), CpuRenderer(gaussian_map).render(small_camera(), POSE), 70)
+
+
 @pytest.mark.parametrize("options", [{"sh_degree": 4}, {"resolution_scale": 0.0}])
 def test_numbers_out_of_range_are_refused(gsplat, options) -> None:
     with pytest.raises(ValueError, match=f"{next(iter(options))} is .*must be from"):
@@ -180,51 +222,52 @@ def test_numbers_out_of_range_are_refused(gsplat, options) -> None:
 
 
 def mirrored(call, means, covars, **options):
-    flip = torch.diag(torch.tensor([-1.0, 1.0, 1.0]))
-    return call(means=means @ flip, covars=flip @ covars @ flip, **options)
+    return call(
+        means=means * torch.tensor([-1.0, 1.0, 1.0]), covars=covars * torch.tensor([1.0, -1, -1, 1, 1, 1]), **options
+    )
 
 
 def half_a_pixel_off(call, Ks, **options):
     return call(Ks=Ks + 0.5 * torch.tensor([[0, 0, 1], [0, 0, 1], [0, 0, 0]]), **options)
 
 
-def harmonics_left_out(call, sh_degree, **options):
-    return call(sh_degree=min(sh_degree, 2), **options)
+def harmonics_left_out(call, degrees_to_use, **options):
+    return call(degrees_to_use=min(degrees_to_use, 2), **options)
 
 
-def not_antialiased(call, rasterize_mode, **options):
-    return call(rasterize_mode="classic", **options)
+def not_antialiased(call, **options):
+    *splats, compensations = call(**options)
+    return *splats, None if compensations is None else torch.ones_like(compensations)
 
 
-def not_a_number(call, **options):
-    rgb, alpha, splats = call(**options)
-    return rgb * torch.nan, alpha, splats
+def not_a_number(call, *arguments, **options):
+    colors, alphas = call(*arguments, **options)
+    return colors * torch.nan, alphas
 
 
 def far_off(call, **options):
-    rgb, alpha, splats = call(**options)
-    return rgb, alpha, splats | {"depths": 1.01 * splats["depths"]}
+    *before, depths, conics, compensations = call(**options)
+    return *before, 1.01 * depths, conics, compensations
 
 
 def broken(call, **options):
-    raise AttributeError("'NoneType' object has no attribute 'projection_ewa_3dgs_packed_fwd'")
+    raise AttributeError("'NoneType' object has no attribute 'PINHOLE'")
 
 
 @pytest.mark.parametrize(
-    ("damage", "reason"),
+    ("function", "damage", "reason"),
     [
-        (mirrored, r"wrong pictures.* dB"),
-        (half_a_pixel_off, r"wrong pictures.* dB"),
-        (harmonics_left_out, r"wrong pictures.* dB"),
-        (not_antialiased, r"wrong pictures.* dB"),
-        (not_a_number, r"wrong pictures.*nan dB"),
-        (far_off, r"wrong pictures.*depth is off"),
-        (broken, r"does not work.*projection_ewa.*nvcc"),
+        ("fully_fused_projection", mirrored, r"wrong pictures.* dB"),
+        ("fully_fused_projection", half_a_pixel_off, r"wrong pictures.* dB"),
+        ("spherical_harmonics", harmonics_left_out, r"wrong pictures.* dB"),
+        ("fully_fused_projection", not_antialiased, r"wrong pictures.* dB"),
+        ("rasterize_to_pixels", not_a_number, r"wrong pictures.*nan dB"),
+        ("fully_fused_projection", far_off, r"wrong pictures.*depth is off"),
+        ("fully_fused_projection", broken, r"does not work.*PINHOLE.*nvcc"),
     ],
 )
-def test_a_gsplat_that_draws_otherwise_is_refused(gsplat, monkeypatch, damage, reason) -> None:
-    intact = gsplat.rasterization
-    monkeypatch.setattr(gsplat, "rasterization", lambda **options: damage(intact, **options))
+def test_a_gsplat_that_draws_otherwise_is_refused(gsplat, monkeypatch, function, damage, reason) -> None:
+    monkeypatch.setattr(gsplat, function, partial(damage, getattr(gsplat, function)))
     with pytest.raises(RuntimeError, match=reason):
         on_stand_in(one_gaussian((0, 0, 2), 0.1, 1.0))
 
@@ -275,7 +318,7 @@ def test_without_cuda_the_reason_is_told(gsplat, monkeypatch, caplog, version, r
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_gsplat_draws_the_picture_that_the_reference_draws(sh_degree: int, antialiased: bool) -> None:
     gaussian_map = replace(random_map(800, sh_degree, seed=sh_degree), antialiased=antialiased)
-    gpu = create_renderer(gaussian_map, "cuda", background=BACKGROUND).render(small_camera(), POSE)
+    gpu = create_renderer(gaussian_map, "cuda", background=BACKGROUND).render(small_camera(), POSE).on_host()
     assert_same(gpu, ReferenceRenderer(gaussian_map, BACKGROUND).render(small_camera(), POSE), 60)
 
 
@@ -283,7 +326,7 @@ def test_gsplat_draws_the_picture_that_the_reference_draws(sh_degree: int, antia
 def test_gsplat_draws_the_same_each_time(room_map, room_camera, room_queries) -> None:
     renderer = create_renderer(room_map, "auto")
     assert isinstance(renderer, GpuRenderer)
-    a, b = (renderer.render(room_camera, room_queries[0].T_map_camera) for _ in range(2))
+    a, b = (renderer.render(room_camera, room_queries[0].T_map_camera).on_host() for _ in range(2))
     for name in ("rgb", "depth", "median_depth", "depth_std", "alpha"):
         np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
 
@@ -291,15 +334,15 @@ def test_gsplat_draws_the_same_each_time(room_map, room_camera, room_queries) ->
 @on_gpu
 @pytest.mark.parametrize("gaussian_map", [random_map(0, 1, seed=0), one_gaussian((0, 0, -2), 0.1, 1.0)])
 def test_gsplat_draws_nothing_where_there_is_nothing(gaussian_map) -> None:
-    render = create_renderer(gaussian_map, "cuda", background=BACKGROUND).render(small_camera(), np.eye(4))
+    render = create_renderer(gaussian_map, "cuda", background=BACKGROUND).render(small_camera(), np.eye(4)).on_host()
     np.testing.assert_array_equal(render.rgb, np.broadcast_to(np.float32(BACKGROUND), render.rgb.shape))
 
 
 @on_gpu
 def test_gsplat_sees_the_room_as_the_cpu_does(room_map, room_camera, room_queries) -> None:
     pose = room_queries[0].T_map_camera
-    gpu = create_renderer(room_map, "cuda").render(room_camera, pose)
-    cpu = create_renderer(room_map, "cpu").render(room_camera, pose)
+    gpu = create_renderer(room_map, "cuda").render(room_camera, pose).on_host()
+    cpu = create_renderer(room_map, "cpu").render(room_camera, pose).on_host()
     assert_same(gpu, cpu, 60)
     error = np.abs(gpu.median_depth - cpu.median_depth) / cpu.median_depth
     assert np.nanquantile(error, 0.5) < 0.005

@@ -6,8 +6,10 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from kornia.color import rgb_to_grayscale
 from random_weights import WRITERS
 
+from gsfeatloc_ros.arrays import to_host
 from gsfeatloc_ros.match import MATCHERS, Features, create_matcher
 from gsfeatloc_ros.match.nearest import match_mutual
 from gsfeatloc_ros.match.peaks import centroid, find_peaks, fit_quadratic
@@ -81,9 +83,10 @@ def test_keypoints_are_inside_the_image_with_unit_descriptors(trained) -> None:
     features = trained[1].features(texture(101, 203))
     assert len(features) > 0
     assert features.keypoints.shape == (len(features), 2)
-    assert (features.keypoints >= -0.5).all()
-    assert (features.keypoints <= [202.5, 100.5]).all()
-    np.testing.assert_allclose(np.linalg.norm(features.descriptors, axis=1), 1.0, atol=1e-4)
+    keypoints = to_host(features.keypoints)
+    assert (keypoints >= -0.5).all()
+    assert (keypoints <= [202.5, 100.5]).all()
+    np.testing.assert_allclose(np.linalg.norm(to_host(features.descriptors), axis=1), 1.0, atol=1e-4)
 
 
 @pytest.mark.parametrize("value", [0, 255])
@@ -138,7 +141,8 @@ def test_superpoint_matches_are_those_of_the_whole_model(create, monkeypatch, na
     for images, least in (([image, image], 5), ([image, shifted(image, 5, 8)], 1)):
         matches = matcher.match(*map(matcher.features, images))
         with torch.inference_mode():
-            whole = matcher._network(torch.stack([to_tensor(image, gray=True)[0] for image in images])[None])
+            grays = [rgb_to_grayscale(to_tensor(image, "cpu"))[0] for image in images]
+            whole = matcher._network(torch.stack(grays)[None])
         partners = whole.matches.reshape(2, -1)[0].numpy()
         a, b = (whole.keypoints[0] * torch.tensor([128, 96])).double().numpy()
         np.testing.assert_allclose(matches.a, a[partners >= 0], atol=1e-4)
@@ -191,14 +195,18 @@ def test_a_centroid_is_the_mean_of_the_window() -> None:
 # Nearest neighbours
 
 
-def test_mutual_matching_equals_the_definition() -> None:
+def described(descriptors: np.ndarray, array=np.asarray) -> Features:
+    """Features with these descriptors, scaled to unit length, whose keypoints' x is their number."""
+    descriptors = descriptors / np.linalg.norm(descriptors, axis=1, keepdims=True)
+    keypoints = np.column_stack([np.arange(len(descriptors)), np.zeros(len(descriptors))])
+    return Features(*(array(part.astype(np.float32)) for part in (keypoints, descriptors, np.ones(len(descriptors)))))
+
+
+@pytest.mark.parametrize("array", [np.asarray, torch.from_numpy])
+def test_mutual_matching_equals_the_definition(array) -> None:
     rng = np.random.default_rng(0)
-    a, b = (rng.normal(size=(n, 8)).astype(np.float32) for n in (30, 40))
-    a, b = (d / np.linalg.norm(d, axis=1, keepdims=True) for d in (a, b))
-    first, second = (
-        Features(np.column_stack([np.arange(len(d)), np.zeros(len(d))]).astype(np.float32), d, np.ones(len(d)))
-        for d in (a, b)
-    )
+    first, second = (described(rng.normal(size=(n, 8)), array) for n in (30, 40))
+    a, b = (to_host(features.descriptors) for features in (first, second))
     distance = np.linalg.norm(a[:, None] - b[None], axis=2)
     expected = []
     for i in range(len(a)):
@@ -209,6 +217,14 @@ def test_mutual_matching_equals_the_definition() -> None:
     matches = match_mutual(first, second, min_similarity=0.3, max_ratio=0.9)
     assert len(expected) > 3
     assert list(zip(matches.a[:, 0], matches.b[:, 0], strict=True)) == expected
+    np.testing.assert_allclose(matches.scores, [a[i] @ b[j] for i, j in expected], rtol=1e-5)
+
+
+@pytest.mark.parametrize("array", [np.asarray, torch.from_numpy])
+def test_a_single_feature_has_no_rival(array) -> None:
+    one, many = (described(np.random.default_rng(0).normal(size=(n, 8)), array) for n in (1, 20))
+    assert len(match_mutual(many, one, max_ratio=0.8)) == 1
+    assert len(match_mutual(one, one, max_ratio=0.8)) == 1
 
 
 def test_an_unknown_matcher_is_refused_by_name() -> None:

@@ -17,6 +17,7 @@ class OutOfMemoryOnce:
 
     def __init__(self, renderer) -> None:
         self._renderer = renderer
+        self.device = renderer.device
         self._calls = 0
 
     def render(self, *arguments):

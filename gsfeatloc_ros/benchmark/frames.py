@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import importlib
 import tempfile
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from gsfeatloc_ros.benchmark.measure import memory_taken, spread, timed
+from gsfeatloc_ros.benchmark.measure import finish, memory_taken, spread, stage_time, timed
 from gsfeatloc_ros.camera import Camera
 from gsfeatloc_ros.evaluate.scene import load_scene
 from gsfeatloc_ros.geometry import make_pose
 from gsfeatloc_ros.maps import GaussianMap, load_map
-from gsfeatloc_ros.render import Renderer, cpu, create_renderer
+from gsfeatloc_ros.render import Render, Renderer, create_renderer
 from gsfeatloc_ros.render.cache import load_prepared
 from gsfeatloc_ros.timing import StageClock
 from gsfeatloc_ros.warmup import warm_up
@@ -28,8 +28,14 @@ _FIELD_OF_VIEW = 65.0  # degrees, horizontal
 _OUTSIDE = 0.05
 # The first frames grow the renderer's buffers.
 UNCOUNTED = 2
-# The CPU renderer's steps by the functions that do them.
-_STAGES = {"visible_chunks": "cull", "project": "project", "gather": "scatter", "blend": "sort and blend"}
+# The renderers' steps by the functions that do them, and the modules where they are looked up.
+_STAGES_ON_CPU = {"visible_chunks": "cull", "project": "project", "gather": "scatter", "blend": "sort and blend"}
+_STAGES_ON_GPU = {
+    "fully_fused_projection": "project",
+    "spherical_harmonics": "colour",
+    "isect_tiles": "tiles and sort",
+    "rasterize_to_pixels": "blend",
+}
 
 
 def measure_map(
@@ -97,20 +103,27 @@ def measure_scene(path: Path, size: Size, device: str, threads: int) -> dict[str
 
 def measure_frames(renderer: Renderer, camera: Camera, poses: list[np.ndarray]) -> dict[str, Any]:
     """Milliseconds of frames at `poses`, (4, 4) each, also by stage (mean), and how much of the last one is covered."""
+
+    def draw(pose: np.ndarray) -> Render:
+        render = renderer.render(camera, pose)
+        finish(renderer.device)
+        return render
+
     for pose in poses[:UNCOUNTED]:
-        renderer.render(camera, pose)
-    frames = [timed(renderer.render, camera, pose) for pose in poses]
+        draw(pose)
+    frames = [timed(draw, pose) for pose in poses]
     # Apart from the others, whose time this is not to cost.
-    with _stages_of_frames() as clock:
+    time_of_stages, now = stage_time(renderer.device)
+    with _stages_of_frames(renderer.device, now) as clock:
         for pose in poses:
-            renderer.render(camera, pose)
+            draw(pose)
     stages = {name: ms / len(poses) for name, ms in clock.milliseconds().items() if name != "total"}
     return {
         "size": [camera.width, camera.height],
         "frames": len(frames),
         "cpu_ms": spread([frame.cpu for frame in frames]),
         "wall_ms": spread([frame.wall for frame in frames]),
-        "stages_cpu_ms": stages,
+        f"stages_{time_of_stages}_ms": stages,
         "coverage": float(frames[-1].result.alpha.mean()),
     }
 
@@ -121,8 +134,10 @@ def print_frames(report: dict[str, Any]) -> None:
     print(f"{report['map']}: {report['gaussians']} Gaussians of SH degree {report['sh_degree']}, {width}x{height}")
     for name, times in (("CPU", report["cpu_ms"]), ("wall", report["wall_ms"])):
         print(f"  {name:4} ms of {report['frames']} frames: min {times['min']:6.1f}  median {times['median']:6.1f}")
-    stages = ", ".join(f"{name} {milliseconds:.1f}" for name, milliseconds in report["stages_cpu_ms"].items())
-    print(f"  CPU  ms by stage, mean: {stages}")
+    for key, name in (("stages_cpu_ms", "CPU "), ("stages_wall_ms", "wall")):
+        if key in report:
+            stages = ", ".join(f"{stage} {milliseconds:.1f}" for stage, milliseconds in report[key].items())
+            print(f"  {name} ms by stage, mean: {stages}")
     for name, figures in report.get("load", {}).items():
         print(
             f"  {name.replace('_', ' ')}: ready to render in {figures['seconds']:.2f} s, at most "
@@ -147,22 +162,24 @@ def view_of_all(gaussian_map: GaussianMap) -> np.ndarray:
 
 
 @contextmanager
-def _stages_of_frames() -> Iterator[StageClock]:
-    """While this is open, the CPU renderer counts the CPU time of its steps on the clock that it gives."""
-    clock = StageClock(time.process_time)
+def _stages_of_frames(device: str, now: Callable[[], float]) -> Iterator[StageClock]:
+    """While this is open, renderers on the device count the time of their steps on the clock that it gives."""
+    clock = StageClock(now)
+    stages = _STAGES_ON_CPU if device == "cpu" else _STAGES_ON_GPU
+    module = importlib.import_module("gsfeatloc_ros.render.cpu" if device == "cpu" else "gsplat")
 
     def counted(function: Callable, stage: str) -> Callable:
-        def call(*arguments: object) -> object:
+        def call(*arguments: object, **options: object) -> object:
             with clock.stage(stage):
-                return function(*arguments)
+                return function(*arguments, **options)
 
         return call
 
-    functions = {name: getattr(cpu, name) for name in _STAGES}
+    functions = {name: getattr(module, name) for name in stages}
     try:
         for name, function in functions.items():
-            setattr(cpu, name, counted(function, _STAGES[name]))
+            setattr(module, name, counted(function, stages[name]))
         yield clock
     finally:
         for name, function in functions.items():
-            setattr(cpu, name, function)
+            setattr(module, name, function)

@@ -35,6 +35,29 @@ def timed(function: Callable[..., T], *arguments: object) -> Timed[T]:
     return Timed(result, 1e3 * (time.process_time() - cpu), 1e3 * (time.perf_counter() - wall))
 
 
+def finish(device: str) -> None:
+    """Wait until a device (Renderer.device) has done all that was asked of it: calls of a GPU return before that."""
+    if device != "cpu":
+        import torch
+
+        torch.cuda.synchronize()
+
+
+def stage_time(device: str) -> tuple[str, Callable[[], float]]:
+    """By which time the stages of work on a device are told, "cpu" or "wall", and the clock for it, in seconds.
+
+    It is the CPU's where the CPU works; on a GPU the wall time, as CPU time would leave the work out.
+    """
+    if device == "cpu":
+        return "cpu", time.process_time
+
+    def now() -> float:
+        finish(device)
+        return time.perf_counter()
+
+    return "wall", now
+
+
 def spread(milliseconds: Sequence[float]) -> dict[str, float]:
     """Smallest and median of several measurements of the same."""
     return {"min": min(milliseconds), "median": float(np.median(milliseconds))}

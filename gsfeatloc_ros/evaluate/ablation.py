@@ -15,9 +15,9 @@ from types import ModuleType
 import numpy as np
 
 from gsfeatloc_ros import localize
+from gsfeatloc_ros.arrays import Array
 from gsfeatloc_ros.camera import Camera
-from gsfeatloc_ros.match.base import Matcher, Matches
-from gsfeatloc_ros.match.track import CornerTracker
+from gsfeatloc_ros.match import Matcher, Matches, create_tracker
 from gsfeatloc_ros.photo import Photo
 from gsfeatloc_ros.pose import lift, solve
 from gsfeatloc_ros.render.base import Render, Renderer
@@ -39,9 +39,9 @@ def without(piece: str, matcher: Matcher) -> Iterator[None]:
     """
     module, values = _NO_LIMITS.get(piece, (localize, {}))
     if piece == "tracking":
-        values = {"CornerTracker": partial(FeatureTracker, matcher)}
+        values = {"create_tracker": partial(FeatureTracker, matcher)}
     if piece == "sub-pixel":
-        values = {"CornerTracker": WholePixelTracker}
+        values = {"create_tracker": WholePixelTracker}
     before = {name: getattr(module, name) for name in values}
     try:
         for name, value in values.items():
@@ -53,23 +53,27 @@ def without(piece: str, matcher: Matcher) -> Iterator[None]:
 
 
 class FeatureTracker:
-    """Has the place of a CornerTracker, and matches features instead."""
+    """Has the place of a tracker of corners, and matches features instead."""
 
-    def __init__(self, matcher: Matcher, photo: Photo) -> None:
+    def __init__(self, matcher: Matcher, photo: Photo, device: str) -> None:
         self._matcher = matcher
         self.corners = matcher.features(photo.image)
 
-    def track(self, image: np.ndarray) -> Matches:
+    def track(self, image: Array) -> Matches:
         """Find the photo's features in a render."""
         return self._matcher.match(self.corners, self._matcher.features(image))
 
 
-class WholePixelTracker(CornerTracker):
+class WholePixelTracker:
     """Without "sub-pixel": where the corners are in the render is rounded."""
 
-    def track(self, image: np.ndarray) -> Matches:
+    def __init__(self, photo: Photo, device: str) -> None:
+        self._tracker = create_tracker(photo, device)
+        self.corners = self._tracker.corners
+
+    def track(self, image: Array) -> Matches:
         """Find the photo's corners in a render."""
-        matches = super().track(image)
+        matches = self._tracker.track(image)
         return replace(matches, b=np.round(matches.b))
 
 
@@ -78,6 +82,7 @@ class MeanDepthRenderer:
 
     def __init__(self, renderer: Renderer) -> None:
         self._renderer = renderer
+        self.device = renderer.device
 
     def render(self, camera: Camera, T_map_camera: np.ndarray) -> Render:
         """Render the map."""

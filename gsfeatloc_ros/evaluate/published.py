@@ -5,6 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from gsfeatloc_ros.arrays import to_host
 from gsfeatloc_ros.camera import Camera
 from gsfeatloc_ros.estimate import Estimate, Status
 from gsfeatloc_ros.geometry import invert, make_pose, transform
@@ -37,7 +38,7 @@ class PublishedLocalizer:
         matches = self._matcher.match(self._matcher.features(image), self._matcher.features(render.image()))
 
         columns, rows = np.trunc(matches.b).astype(int).T
-        depth = render.depth[rows, columns].astype(np.float64)
+        depth = to_host(render.depth[rows, columns]).astype(np.float64)
         lifted = np.isfinite(depth)
         if lifted.sum() < _MIN_MATCHES:
             return Estimate(

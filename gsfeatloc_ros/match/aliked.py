@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 from kornia.feature import ALIKED
 
+from gsfeatloc_ros.arrays import Array
 from gsfeatloc_ros.match.base import Features
 from gsfeatloc_ros.match.peaks import find_peaks, fit_quadratic
 from gsfeatloc_ros.match.tensor import to_tensor
@@ -25,8 +25,8 @@ _WEIGHTS = Weights(
 class AlikedExtractor:
     """ALIKED features."""
 
-    def __init__(self, weights: str, max_features: int) -> None:
-        """Load the network; `weights` is a path, or "" for the usual places.
+    def __init__(self, weights: str, max_features: int, device: str) -> None:
+        """Load the network onto a device; `weights` is a path, or "" for the usual places.
 
         Raises:
             WeightsError: the weights cannot be had or are not ALIKED's.
@@ -34,14 +34,16 @@ class AlikedExtractor:
         self._max_features = max_features
         self._aliked = ALIKED(_MODEL)
         fill(self._aliked, _WEIGHTS.load(weights), "ALIKED", derived=("dkd.hw_grid",))
+        self._aliked.to(device)
+        self._device = device
 
     @torch.inference_mode()
-    def features(self, image: np.ndarray) -> Features:
+    def features(self, image: Array) -> Features:
         """Extract the features of an RGB image (H, W, 3) uint8."""
-        feature_map, score_map = self._aliked.extract_dense_map(to_tensor(image))
+        feature_map, score_map = self._aliked.extract_dense_map(to_tensor(image, self._device))
         scores = score_map[0, 0]
         peaks = find_peaks(scores, _THRESHOLD, self._max_features)
         keypoints = fit_quadratic(peaks, scores.logit(eps=1e-6))
-        corner = torch.tensor(image.shape[1::-1]) - 1
+        corner = torch.tensor(image.shape[1::-1]).to(self._device, non_blocking=True) - 1
         descriptors = self._aliked.desc_head(feature_map, [keypoints / corner * 2 - 1])[0][0]
-        return Features(keypoints.numpy(), descriptors.numpy(), scores[peaks[:, 1], peaks[:, 0]].numpy())
+        return Features(keypoints, descriptors, scores[peaks[:, 1], peaks[:, 0]])

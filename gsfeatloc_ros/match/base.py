@@ -8,10 +8,12 @@ from typing import Protocol, TypeVar
 
 import numpy as np
 
+from gsfeatloc_ros.arrays import Array, to_host
+
 
 @dataclass(frozen=True, eq=False)
 class Features:
-    """Local features of one image.
+    """Local features of one image, on the device of the matcher that found them.
 
     Attributes:
         keypoints: (N, 2) float32 sub-pixel positions; the centre of the top-left pixel is (0, 0).
@@ -19,9 +21,9 @@ class Features:
         scores: (N,) float32, higher is better.
     """
 
-    keypoints: np.ndarray
-    descriptors: np.ndarray
-    scores: np.ndarray
+    keypoints: Array
+    descriptors: Array
+    scores: Array
 
     def __len__(self) -> int:
         return len(self.keypoints)
@@ -34,7 +36,7 @@ class Features:
 
 @dataclass(frozen=True, eq=False)
 class Matches:
-    """Pixels of two images that show the same thing.
+    """Pixels of two images that show the same thing; always on the host, where poses are solved.
 
     Attributes:
         a: (M, 2) float64 pixels in the first image.
@@ -54,18 +56,29 @@ class Matches:
         return Matches(self.a[kept], self.b[kept], self.scores[kept])
 
     @staticmethod
-    def from_indices(a: Features, b: Features, index_a: np.ndarray, index_b: np.ndarray, scores: np.ndarray) -> Matches:
+    def from_indices(a: Features, b: Features, index_a: Array, index_b: Array, scores: Array) -> Matches:
         """Matches between the features `index_a` (M,) of `a` and `index_b` (M,) of `b`."""
-        return Matches(
-            a.keypoints[index_a].astype(np.float64),
-            b.keypoints[index_b].astype(np.float64),
-            np.asarray(scores, dtype=np.float64),
-        )
+        numbers = (a.keypoints[index_a], b.keypoints[index_b], scores)
+        return Matches(*(to_host(array).astype(np.float64) for array in numbers))
 
     @staticmethod
     def none() -> Matches:
         """No matches."""
         return Matches(np.empty((0, 2)), np.empty((0, 2)), np.empty(0))
+
+
+class Tracker(Protocol):
+    """Finds the corners of one photo in renders of nearly the same view.
+
+    Attributes:
+        corners: of the photo; others look at nothing but their number.
+    """
+
+    corners: Sized
+
+    def track(self, image: Array) -> Matches:
+        """Find the photo's corners in a render (H, W, 3) uint8 RGB of its size; those that cannot be are left out."""
+        ...
 
 
 F = TypeVar("F", bound=Sized)
@@ -74,18 +87,19 @@ F = TypeVar("F", bound=Sized)
 class Extractor(Protocol):
     """Finds local features."""
 
-    def features(self, image: np.ndarray) -> Features:
-        """Extract the features of an RGB image (H, W, 3) uint8; an image without any gives empty arrays."""
+    def features(self, image: Array) -> Features:
+        """Extract the features of an RGB image (H, W, 3) uint8; an image without any gives none."""
         ...
 
 
 class Matcher(Protocol[F]):
     """Finds matches between two images in two steps, so that one image's features serve many comparisons.
 
-    What `features` returns is for the same matcher's `match`; others look at nothing but its length.
+    Images may lie on any device. What `features` returns is for the same matcher's `match`; others look at nothing but
+    its length.
     """
 
-    def features(self, image: np.ndarray) -> F:
+    def features(self, image: Array) -> F:
         """Extract the features of an RGB image (H, W, 3) uint8; of an image without any the length is 0."""
         ...
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 from kornia.feature import DISK
 
+from gsfeatloc_ros.arrays import Array
 from gsfeatloc_ros.match.base import Features
 from gsfeatloc_ros.match.peaks import find_peaks, fit_quadratic
 from gsfeatloc_ros.match.tensor import is_blank, to_tensor
@@ -25,8 +25,8 @@ _WEIGHTS = Weights(
 class DiskExtractor:
     """DISK features."""
 
-    def __init__(self, weights: str, max_features: int) -> None:
-        """Load the network; `weights` is a path, or "" for the usual places.
+    def __init__(self, weights: str, max_features: int, device: str) -> None:
+        """Load the network onto a device; `weights` is a path, or "" for the usual places.
 
         Raises:
             WeightsError: the weights cannot be had or are not DISK's.
@@ -34,16 +34,18 @@ class DiskExtractor:
         self._max_features = max_features
         self._disk = DISK()
         fill(self._disk, _WEIGHTS.load(weights).get("extractor", {}), "DISK")
+        self._disk.to(device)
+        self._device = device
 
     @torch.inference_mode()
-    def features(self, image: np.ndarray) -> Features:
+    def features(self, image: Array) -> Features:
         """Extract the features of an RGB image (H, W, 3) uint8."""
         if is_blank(image):
             return Features.none(self._disk.desc_dim)
         height, width = image.shape[:2]
-        heatmap, dense = self._disk.heatmap_and_dense_descriptors(to_tensor(image, _STRIDE))
+        heatmap, dense = self._disk.heatmap_and_dense_descriptors(to_tensor(image, self._device, _STRIDE))
         heatmap = heatmap[0, 0, :height, :width]
         peaks = find_peaks(heatmap, _THRESHOLD, self._max_features)
         x, y = peaks.T
         descriptors = torch.nn.functional.normalize(dense[0, :, y, x].T, dim=1)
-        return Features(fit_quadratic(peaks, heatmap).numpy(), descriptors.numpy(), heatmap[y, x].numpy())
+        return Features(fit_quadratic(peaks, heatmap), descriptors, heatmap[y, x])

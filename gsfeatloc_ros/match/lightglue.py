@@ -10,10 +10,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import torch
 from kornia.feature import LightGlue
 
+from gsfeatloc_ros.arrays import Array
 from gsfeatloc_ros.match.base import Extractor, Features, Matches
 from gsfeatloc_ros.match.weights import Weights, WeightsError, fill
 
@@ -48,15 +48,21 @@ class LightGlueMatcher:
     """Local features, matched by LightGlue. It stops early, and drops features on the way, where the match is easy."""
 
     def __init__(
-        self, extractor: Callable[[str, int], Extractor], features: str, weights: str, max_features: int
+        self,
+        extractor: Callable[[str, int, str], Extractor],
+        features: str,
+        weights: str,
+        max_features: int,
+        device: str,
     ) -> None:
         """Load both networks.
 
         Args:
-            extractor: makes the extractor from its weights and the number of features.
+            extractor: makes the extractor from its weights, the number of features and the device.
             features: kind of features: xfeat, aliked or disk.
             weights: folder with the files of both networks, named as in torch hub's cache; "" for the usual places.
             max_features: most features taken from an image.
+            device: of torch's, on which both run.
 
         Raises:
             WeightsError: the weights cannot be had or are of other networks.
@@ -66,16 +72,17 @@ class LightGlueMatcher:
                 f"{weights} is not a folder: two networks are to be loaded, from a folder (parameter matcher.weights) "
                 f"that holds {_WEIGHTS[features].file_name} and the extractor's file, named as in torch hub's cache"
             )
-        self._extractor = extractor(weights, max_features)
+        self._extractor = extractor(weights, max_features, device)
         configuration = {key: value for key, value in LightGlue.features[features].items() if key != "weights"}
         self._network = LightGlue(None, **configuration)
         state = {_current(name): tensor for name, tensor in _WEIGHTS[features].load(weights).items()}
         fill(self._network, state, f"LightGlue for {features}", derived=("confidence_thresholds",))
+        self._network.to(device)
 
-    def features(self, image: np.ndarray) -> PlacedFeatures:
+    def features(self, image: Array) -> PlacedFeatures:
         """Extract the features of an RGB image (H, W, 3) uint8."""
         found = self._extractor.features(image)
-        return PlacedFeatures(found.keypoints, found.descriptors, found.scores, image.shape[1::-1])
+        return PlacedFeatures(found.keypoints, found.descriptors, found.scores, tuple(image.shape[1::-1]))
 
     @torch.inference_mode()
     def match(self, a: PlacedFeatures, b: PlacedFeatures) -> Matches:
@@ -83,8 +90,8 @@ class LightGlueMatcher:
         if len(a) == 0 or len(b) == 0:
             return Matches.none()
         found = self._network({"image0": _network_input(a), "image1": _network_input(b)})
-        index_a, index_b = found["matches"][0].numpy().T
-        return Matches.from_indices(a, b, index_a, index_b, found["scores"][0].numpy())
+        index_a, index_b = found["matches"][0].T
+        return Matches.from_indices(a, b, index_a, index_b, found["scores"][0])
 
 
 def _current(name: str) -> str:
@@ -94,9 +101,9 @@ def _current(name: str) -> str:
 
 def _network_input(features: PlacedFeatures) -> dict[str, torch.Tensor]:
     # kornia refuses keypoints outside the image, where a fraction of a pixel may have moved them.
-    keypoints = np.clip(features.keypoints, 0, np.array(features.size, dtype=np.float32))
+    size = torch.tensor(features.size).to(features.keypoints.device, non_blocking=True)
     return {
-        "keypoints": torch.from_numpy(keypoints)[None],
-        "descriptors": torch.from_numpy(features.descriptors)[None],
-        "image_size": torch.tensor(features.size)[None],
+        "keypoints": features.keypoints.clamp(min=torch.zeros_like(size), max=size)[None],
+        "descriptors": features.descriptors[None],
+        "image_size": size[None],
     }

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
 import torch
+from kornia.color import rgb_to_grayscale
 from kornia.feature import LoFTR
 
+from gsfeatloc_ros.arrays import Array
 from gsfeatloc_ros.match.base import Matches
 from gsfeatloc_ros.match.tensor import is_blank, to_tensor
 from gsfeatloc_ros.match.weights import Weights, fill
@@ -33,12 +34,13 @@ class DenseFeatures:
 class LoftrMatcher:
     """LoFTR with the weights for outdoor scenes (MegaDepth)."""
 
-    def __init__(self, weights: str, max_features: int) -> None:
+    def __init__(self, weights: str, max_features: int, device: str) -> None:
         """Load the network.
 
         Args:
             weights: path of the weights; "" for the usual places.
             max_features: most matches of two images.
+            device: of torch's, on which it runs.
 
         Raises:
             WeightsError: the weights cannot be had or are not LoFTR's.
@@ -46,13 +48,15 @@ class LoftrMatcher:
         self._max_matches = max_features
         self._loftr = LoFTR(None)
         fill(self._loftr, _WEIGHTS.load(weights).get("state_dict", {}), "LoFTR")
+        self._loftr.to(device)
+        self._device = device
 
     @torch.inference_mode()
-    def features(self, image: np.ndarray) -> DenseFeatures:
+    def features(self, image: Array) -> DenseFeatures:
         """Compute the feature maps of an RGB image (H, W, 3) uint8."""
         if is_blank(image):
             return DenseFeatures(None)
-        return DenseFeatures(self._loftr.extract_features(to_tensor(image, gray=True)))
+        return DenseFeatures(self._loftr.extract_features(rgb_to_grayscale(to_tensor(image, self._device))))
 
     @torch.inference_mode()
     def match(self, a: DenseFeatures, b: DenseFeatures) -> Matches:
@@ -63,5 +67,5 @@ class LoftrMatcher:
         confidence, best = found["confidence"].sort(descending=True)
         best = best[: self._max_matches]
         # LoFTR learned from COLMAP's cameras, in whose pixels the centre of the first is (0.5, 0.5).
-        pixels_a, pixels_b = (found[key][best].double().numpy() - 0.5 for key in ("keypoints0", "keypoints1"))
-        return Matches(pixels_a, pixels_b, confidence[: len(best)].double().numpy())
+        pixels_a, pixels_b = (found[key][best].cpu().double().numpy() - 0.5 for key in ("keypoints0", "keypoints1"))
+        return Matches(pixels_a, pixels_b, confidence[: len(best)].cpu().double().numpy())

@@ -11,7 +11,7 @@ def match_mutual(a: Features, b: Features, min_similarity: float = -1.0, max_rat
     """Match features that are each other's nearest, by unit descriptors.
 
     Args:
-        a, b: features of the two images.
+        a, b: features of the two images, on one device.
         min_similarity: least cosine between two matched descriptors.
         max_ratio: Lowe's ratio test: the distance to the nearest descriptor of `b` must be less than this many times
             the distance to the second nearest.
@@ -21,14 +21,38 @@ def match_mutual(a: Features, b: Features, min_similarity: float = -1.0, max_rat
     """
     if len(a) == 0 or len(b) == 0:
         return Matches.none()
-    similarity = a.descriptors @ b.descriptors.T
-    nearest = similarity.argmax(axis=1)
-    rows = np.arange(len(a))
-    best = similarity[rows, nearest]
-    kept = (similarity.argmax(axis=0)[nearest] == rows) & (best >= min_similarity)
+    nearest = _nearest if isinstance(a.descriptors, np.ndarray) else _nearest_on_device
+    best, second, mutual, *pixels = nearest(a, b).T
+    kept = (mutual > 0) & (best >= min_similarity)
     if max_ratio < 1.0:
-        similarity[rows, nearest] = -1.0
-        second = similarity.max(axis=1)
         # Of unit vectors, the squared distance is 2 - 2 cosine.
         kept &= (1.0 - best) < max_ratio**2 * (1.0 - second)
-    return Matches.from_indices(a, b, rows[kept], nearest[kept], np.clip(best[kept], 0.0, 1.0))
+    x_a, y_a, x_b, y_b = (coordinate[kept].astype(np.float64) for coordinate in pixels)
+    scores = np.clip(best[kept].astype(np.float64), 0.0, 1.0)
+    return Matches(np.column_stack([x_a, y_a]), np.column_stack([x_b, y_b]), scores)
+
+
+def _nearest(a: Features, b: Features) -> np.ndarray:
+    """For each of the N features of `a`, what the nearest in `b` is: (N, 7).
+
+    Its similarity, that of the second nearest (-1 if there is none), whether the feature is the nearest's nearest, and
+    the keypoints: x and y of the feature, x and y of the nearest.
+    """
+    similarity = a.descriptors @ b.descriptors.T
+    rows, nearest = np.arange(len(a)), similarity.argmax(axis=1)
+    mutual = similarity.argmax(axis=0)[nearest] == rows
+    best = similarity[rows, nearest]
+    similarity[rows, nearest] = -1.0
+    return np.column_stack([best, similarity.max(axis=1), mutual, a.keypoints, b.keypoints[nearest]])
+
+
+def _nearest_on_device(a: Features, b: Features) -> np.ndarray:
+    """The same from tensors, in one copy, as each waits for the device."""
+    import torch
+
+    similarity = a.descriptors @ b.descriptors.T
+    values, columns = similarity.topk(min(2, len(b)), dim=1)
+    nearest = columns[:, 0]
+    mutual = similarity.argmax(dim=0)[nearest] == torch.arange(len(a), device=nearest.device)
+    values = torch.nn.functional.pad(values, (0, 2 - values.shape[1]), value=-1.0)
+    return torch.column_stack([values, mutual, a.keypoints, b.keypoints[nearest]]).cpu().numpy()

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import functools
+
 import torch
 from kornia.geometry.subpix import nms2d
 
 _WINDOW = 5
+# x, y of the pixels of a 3x3 window.
 _OFFSETS = torch.tensor([(dx, dy) for dy in (-1, 0, 1) for dx in (-1, 0, 1)])
 
 
@@ -27,9 +30,7 @@ def fit_quadratic(peaks: torch.Tensor, logits: torch.Tensor) -> torch.Tensor:
         peaks: (N, 2) int64 x, y.
         logits: (H, W) heatmap before its sigmoid or softmax.
     """
-    x, y = _OFFSETS.float().T
-    terms = torch.stack([x * x, y * y, x * y, x, y, torch.ones_like(x)], dim=1)
-    xx, yy, xy, x, y, _ = (_windows(peaks, logits) @ torch.linalg.pinv(terms).T).T
+    xx, yy, xy, x, y, _ = (_windows(peaks, logits) @ _quadratic_fit(logits.device)).T
     determinant = 4 * xx * yy - xy * xy
     top = torch.stack([xy * y - 2 * yy * x, xy * x - 2 * xx * y], dim=1) / determinant[:, None]
     # The pixel is the highest: farther than half a pixel the fit is wrong.
@@ -47,7 +48,7 @@ def centroid(peaks: torch.Tensor, heatmap: torch.Tensor) -> torch.Tensor:
         heatmap: (H, W), not negative.
     """
     weights = _windows(peaks, heatmap)
-    return peaks + weights @ _OFFSETS.float() / weights.sum(dim=1, keepdim=True)
+    return peaks + weights @ _offsets(heatmap.device).float() / weights.sum(dim=1, keepdim=True)
 
 
 def cell_heatmap(logits: torch.Tensor) -> torch.Tensor:
@@ -59,4 +60,18 @@ def _windows(peaks: torch.Tensor, heatmap: torch.Tensor) -> torch.Tensor:
     """The 3x3 windows (N, 9) round peaks; what is outside repeats the border."""
     padded = torch.nn.functional.pad(heatmap[None, None], (1, 1, 1, 1), mode="replicate")[0, 0]
     x, y = peaks.T
-    return padded[y[:, None] + 1 + _OFFSETS[:, 1], x[:, None] + 1 + _OFFSETS[:, 0]]
+    dx, dy = _offsets(peaks.device).T
+    return padded[y[:, None] + 1 + dy, x[:, None] + 1 + dx]
+
+
+@functools.cache
+def _offsets(device: torch.device) -> torch.Tensor:
+    return _OFFSETS.to(device)
+
+
+@functools.cache
+def _quadratic_fit(device: torch.device) -> torch.Tensor:
+    """(9, 6): by this the windows' values give the coefficients of xx, yy, xy, x, y and 1."""
+    x, y = _OFFSETS.float().T
+    terms = torch.stack([x * x, y * y, x * y, x, y, torch.ones_like(x)], dim=1)
+    return torch.linalg.pinv(terms).T.to(device)

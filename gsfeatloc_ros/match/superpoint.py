@@ -10,9 +10,10 @@ from __future__ import annotations
 import logging
 from pathlib import Path
 
-import numpy as np
 import torch
+from kornia.color import rgb_to_grayscale
 
+from gsfeatloc_ros.arrays import Array
 from gsfeatloc_ros.match.base import Matches
 from gsfeatloc_ros.match.lightglue import PlacedFeatures
 from gsfeatloc_ros.match.peaks import cell_heatmap, centroid
@@ -32,7 +33,7 @@ _STRIDE = 8
 class SuperPointMatcher:
     """SuperPoint features, matched by a network. Not measured: its weights are not to be had where this was written."""
 
-    def __init__(self, network: str, weights: str, max_features: int) -> None:
+    def __init__(self, network: str, weights: str, max_features: int, device: str) -> None:
         """Load both networks, which are one model of Hugging Face.
 
         Args:
@@ -40,12 +41,14 @@ class SuperPointMatcher:
             weights: folder that save_pretrained() wrote or a clone of the hub's, or the name of a model on the hub; ""
                 for the authors' on the hub or in its cache.
             max_features: most features taken from an image.
+            device: of torch's, on which both run.
 
         Raises:
             WeightsError: transformers is not installed, or the weights cannot be had or are of other networks.
         """
         class_name, hub_name = _MODELS[network]
-        self._network = _load(class_name, str(Path(weights).expanduser()) if weights else hub_name)
+        self._network = _load(class_name, str(Path(weights).expanduser()) if weights else hub_name).to(device)
+        self._device = device
         _log.warning(
             "superpoint-%s: Magic Leap's weights of SuperPoint and SuperGlue are licensed for noncommercial research "
             "by academic or non-profit organizations only",
@@ -56,9 +59,9 @@ class SuperPointMatcher:
         self._takes_scores = network == "superglue"
 
     @torch.inference_mode()
-    def features(self, image: np.ndarray) -> PlacedFeatures:
+    def features(self, image: Array) -> PlacedFeatures:
         """Extract the features of an RGB image (H, W, 3) uint8."""
-        tensor = to_tensor(image, _STRIDE, gray=True)
+        tensor = rgb_to_grayscale(to_tensor(image, self._device, _STRIDE))
         logits = []
         hook = self._superpoint.keypoint_decoder.conv_score_b.register_forward_hook(
             lambda _module, _inputs, output: logits.append(output)
@@ -68,13 +71,13 @@ class SuperPointMatcher:
         finally:
             hook.remove()
         # Given as fractions of the image's size.
-        peaks = (found.keypoints[0] * torch.tensor(tensor.shape[:1:-1])).round().long()
+        peaks = (found.keypoints[0] * torch.tensor(tensor.shape[:1:-1], device=self._device)).round().long()
         height, width = image.shape[:2]
-        inside = (peaks < torch.tensor([width, height])).all(dim=1)
+        inside = ((peaks[:, 0] < width) & (peaks[:, 1] < height)).nonzero()[:, 0]
         return PlacedFeatures(
-            centroid(peaks[inside], cell_heatmap(logits[0])).numpy(),
-            found.descriptors[0, inside].numpy(),
-            found.scores[0, inside].numpy(),
+            centroid(peaks[inside], cell_heatmap(logits[0])),
+            found.descriptors[0, inside],
+            found.scores[0, inside],
             (width, height),
         )
 
@@ -86,19 +89,19 @@ class SuperPointMatcher:
         keypoints = _pair(a.keypoints, b.keypoints)
         descriptors = _pair(a.descriptors, b.descriptors)
         scores = _pair(a.scores, b.scores)
-        mask = _pair(np.ones(len(a), np.int32), np.ones(len(b), np.int32))
-        width, height = np.maximum(a.size, b.size)
+        mask = _pair(*(torch.ones(len(features), dtype=torch.int32, device=self._device) for features in (a, b)))
+        width, height = map(max, a.size, b.size)
         # Of forward(), the part after extraction: it takes images, and would extract the photo's features every time.
         inputs = (keypoints, descriptors, scores) if self._takes_scores else (keypoints, descriptors)
         matches, matching_scores = self._network._match_image_pair(*inputs, height, width, mask=mask)[:2]
-        index_b = matches.reshape(2, -1)[0, : len(a)].numpy()
-        index_a = np.flatnonzero(index_b >= 0)
-        return Matches.from_indices(a, b, index_a, index_b[index_a], matching_scores.reshape(2, -1)[0].numpy()[index_a])
+        index_b = matches.reshape(2, -1)[0, : len(a)]
+        index_a = (index_b >= 0).nonzero().ravel()
+        return Matches.from_indices(a, b, index_a, index_b[index_a], matching_scores.reshape(2, -1)[0, index_a])
 
 
-def _pair(a: np.ndarray, b: np.ndarray) -> torch.Tensor:
-    """Stack two arrays (N, ...) and (M, ...), the shorter one filled with zeros: (1, 2, max(N, M), ...)."""
-    return torch.nn.utils.rnn.pad_sequence([torch.from_numpy(a), torch.from_numpy(b)], batch_first=True)[None]
+def _pair(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    """Stack two tensors (N, ...) and (M, ...), the shorter one filled with zeros: (1, 2, max(N, M), ...)."""
+    return torch.nn.utils.rnn.pad_sequence([a, b], batch_first=True)[None]
 
 
 def _load(class_name: str, name: str) -> torch.nn.Module:

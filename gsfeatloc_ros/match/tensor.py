@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-import cv2
-import numpy as np
 import torch
 
+from gsfeatloc_ros.arrays import Array
 
-def is_blank(image: np.ndarray) -> bool:
+
+def is_blank(image: Array) -> bool:
     """Whether an RGB image (H, W, 3) has one colour: networks that normalize contrast find something even in that."""
     return bool((image == image[0, 0]).all())
 
 
-def to_tensor(image: np.ndarray, multiple: int = 1, gray: bool = False) -> torch.Tensor:
-    """Turn an RGB image (H, W, 3) uint8 into a tensor (1, 3 or 1, H', W') float32 in [0, 1].
+def to_tensor(image: Array, device: str, multiple: int = 1) -> torch.Tensor:
+    """Turn an RGB image (H, W, 3) uint8 into a tensor (1, 3, H', W') float32 in [0, 1] on a device.
 
     H' and W' are the next multiples of `multiple`. The image is padded at the bottom and right, not resized: pixels
     stay where they are, and a resampled image has weaker features.
     """
-    if gray:
-        image = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)[..., None]
-    tensor = torch.from_numpy(image).permute(2, 0, 1)[None].float() / 255.0
+    tensor = torch.as_tensor(image).to(device).permute(2, 0, 1)[None].float() / 255.0
     height, width = image.shape[:2]
     return torch.nn.functional.pad(tensor, (0, -width % multiple, 0, -height % multiple), mode="replicate")

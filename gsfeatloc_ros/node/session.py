@@ -148,7 +148,7 @@ class Session:
         topics = " ".join(subscription.topic_name for subscription in self._subscriptions)
         self._node.get_logger().info(
             f"ready: map {self._engine.map_path} (frame {self._values['map.frame_id']}), matcher "
-            f"{self._values['matcher.name']}, renderer {self._engine.device}, {self._values['mode']}, "
+            f"{self._values['matcher.name']}, on {self._engine.renderer.device}, {self._values['mode']}, "
             f"topics {topics} -> {self._answers.topic}"
         )
         self._diagnose(OK, "ready", f"ready: {self._no_image}", {})
@@ -375,5 +375,5 @@ class Session:
             level, reason = self._health.judge(values["image.timeout"], mode != "on_request", self._no_image)
         last = self._answers.last_stamp
         age = "nan" if last is None else f"{1e-9 * (self._node.get_clock().now().nanoseconds - last):.1f}"
-        about = {"mode": mode, "map": self._engine.map_path, "device": self._engine.device, "answer_age": age}
+        about = {"mode": mode, "map": self._engine.map_path, "device": self._engine.renderer.device, "answer_age": age}
         self._reporter.diagnose("health", level, reason, about | self._health.values() | self._counts)

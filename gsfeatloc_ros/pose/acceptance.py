@@ -5,6 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from gsfeatloc_ros.arrays import to_host
 from gsfeatloc_ros.photo import Photo
 from gsfeatloc_ros.render.base import Render
 from gsfeatloc_ros.structure import local_structure
@@ -54,7 +55,7 @@ def agreement(photo: Photo, render: Render) -> float:
     """
     camera = photo.camera
     size = (_COMPARED_WIDTH, max(1, round(_COMPARED_WIDTH * camera.height / camera.width)))
-    covered = photo.seen & (render.alpha >= _MIN_ALPHA)
+    covered = photo.seen & (to_host(render.alpha) >= _MIN_ALPHA)
     covered = cv2.resize(covered.astype(np.float32), size, interpolation=cv2.INTER_AREA) > _MIN_COVERED
     (photo_structure, photo_contrast), (map_structure, map_contrast) = (
         local_structure(cv2.resize(gray, size, interpolation=cv2.INTER_AREA), _NEIGHBOURHOOD, _MIN_CONTRAST)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gsfeatloc_ros.arrays import to_host
 from gsfeatloc_ros.camera import Camera
 from gsfeatloc_ros.geometry import transform
 from gsfeatloc_ros.render.base import Render
@@ -51,14 +52,16 @@ def lift(render: Render, camera: Camera, T_map_camera: np.ndarray, pixels: np.nd
     fx, fy = np.clip(x - column, 0, 1), np.clip(y - row, 0, 1)
     weights = np.stack([(1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy], axis=1)
 
-    depths = render.median_depth[rows, columns].astype(np.float64)  # (M, 4), NaN where there is none
+    # (M, 4) each, NaN where there is none; of a render on a GPU only these come to the host.
+    depths, depth_stds, alphas = (
+        to_host(picture[rows, columns]).astype(np.float64)
+        for picture in (render.median_depth, render.depth_std, render.alpha)
+    )
     depth = (weights * depths).sum(axis=1)
-    depth_std = np.minimum((weights * render.depth_std[rows, columns]).sum(axis=1), MAX_DEPTH_STD * depth)
+    depth_std = np.minimum((weights * depth_stds).sum(axis=1), MAX_DEPTH_STD * depth)
     # Comparisons with NaN are false: what has no depth is not valid.
     valid = (
-        inside
-        & (render.alpha[rows, columns].min(axis=1) >= MIN_ALPHA)
-        & (depths.max(axis=1) - depths.min(axis=1) <= MAX_DEPTH_STEP * depth)
+        inside & (alphas.min(axis=1) >= MIN_ALPHA) & (depths.max(axis=1) - depths.min(axis=1) <= MAX_DEPTH_STEP * depth)
     )
     depth = np.where(valid, depth, np.nan)
     rays = camera.rays(pixels)

@@ -5,15 +5,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from gsfeatloc_ros.maps.gaussian_map import GaussianMap
-from gsfeatloc_ros.render.availability import explain_fallback, gpu_problem
+from gsfeatloc_ros.render.availability import DEVICES, chosen_device
 from gsfeatloc_ros.render.base import Render, Renderer
 
 if TYPE_CHECKING:
     from gsfeatloc_ros.render.prepare import PreparedMap
 
-__all__ = ["DEVICES", "Render", "Renderer", "create_renderer"]
-
-DEVICES = ("auto", "cpu", "cuda")
+__all__ = ["DEVICES", "Render", "Renderer", "chosen_device", "create_renderer"]
 
 
 def create_renderer(
@@ -39,15 +37,8 @@ def create_renderer(
         ValueError: an unknown device, or a number out of its range.
         RuntimeError: device "cuda" cannot be used; the message says what is missing and what to do.
     """
-    if device not in DEVICES:
-        raise ValueError(f"renderer device {device!r} is not one of {', '.join(DEVICES)}")
-    problem = "" if device == "cpu" else gpu_problem()
-    if device == "cuda" and problem:
-        raise RuntimeError(f"renderer device cuda: {problem}")
     # Imported here: numba and torch take a second each, and users of the protocol alone do not need them.
-    if device == "cpu" or problem:
-        if problem:
-            explain_fallback(problem)
+    if chosen_device(device) == "cpu":
         from gsfeatloc_ros.render.cpu import CpuRenderer
 
         return CpuRenderer(gaussian_map, threads, background, sh_degree, resolution_scale)

@@ -1,10 +1,12 @@
-"""Whether this machine can render on a GPU; without gsplat it cannot, and torch is not loaded to find that out."""
+"""On what to render and match; without gsplat a GPU is of no use, and torch is not loaded to find that out."""
 
 from __future__ import annotations
 
 import functools
 import importlib.util
 import logging
+
+DEVICES = ("auto", "cpu", "cuda")
 
 _log = logging.getLogger(__name__)
 
@@ -23,6 +25,23 @@ def gpu_problem() -> str:
     from gsfeatloc_ros.render.gpu import self_check
 
     return self_check("cuda")
+
+
+def chosen_device(device: str) -> str:
+    """The device that a name of DEVICES stands for here: "cpu" or "cuda".
+
+    Raises:
+        ValueError: an unknown name.
+        RuntimeError: "cuda" cannot be used; the message says what is missing and what to do.
+    """
+    if device not in DEVICES:
+        raise ValueError(f"renderer device {device!r} is not one of {', '.join(DEVICES)}")
+    problem = "" if device == "cpu" else gpu_problem()
+    if device == "cuda" and problem:
+        raise RuntimeError(f"renderer device cuda: {problem}")
+    if problem:
+        explain_fallback(problem)
+    return "cpu" if device == "cpu" or problem else "cuda"
 
 
 @functools.cache

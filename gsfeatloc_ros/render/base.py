@@ -8,6 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
+from gsfeatloc_ros.arrays import Array, to_host
 from gsfeatloc_ros.camera import Camera
 from gsfeatloc_ros.maps.gaussian_map import GaussianMap
 
@@ -25,7 +26,7 @@ DEPTH_MIN_ALPHA = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Render:
-    """What a camera at one pose would see of the map.
+    """What a camera at one pose would see of the map: pictures, on the device of the renderer that drew them.
 
     Attributes:
         rgb: (H, W, 3) float32 in [0, 1], on the renderer's background.
@@ -36,19 +37,35 @@ class Render:
         alpha: (H, W) float32 in [0, 1], how much of the pixel the splats cover.
     """
 
-    rgb: np.ndarray
-    depth: np.ndarray
-    median_depth: np.ndarray
-    depth_std: np.ndarray
-    alpha: np.ndarray
+    rgb: Array
+    depth: Array
+    median_depth: Array
+    depth_std: Array
+    alpha: Array
+
+    def device_image(self) -> Array:
+        """Colours as an 8-bit RGB image (H, W, 3), where they were drawn."""
+        levels = (self.rgb * 255.0).round()
+        return levels.astype(np.uint8) if isinstance(levels, np.ndarray) else levels.byte()
 
     def image(self) -> np.ndarray:
-        """Colours as an 8-bit RGB image (H, W, 3)."""
-        return np.rint(self.rgb * 255.0).astype(np.uint8)
+        """The same on the host."""
+        return to_host(self.device_image())
+
+    def on_host(self) -> Render:
+        """All pictures as numpy's arrays."""
+        pictures = (self.rgb, self.depth, self.median_depth, self.depth_std, self.alpha)
+        return Render(*(to_host(picture) for picture in pictures))
 
 
 class Renderer(Protocol):
-    """Draws a map. Implementations are safe to call from any thread and release the GIL."""
+    """Draws a map. Implementations are safe to call from any thread and release the GIL.
+
+    Attributes:
+        device: where renders lie: "cpu" for arrays of numpy's, or the device of torch's tensors.
+    """
+
+    device: str
 
     def render(self, camera: Camera, T_map_camera: np.ndarray) -> Render:
         """Draw what `camera` (its distortion ignored) sees from the pose `T_map_camera` (4, 4)."""
@@ -58,7 +75,8 @@ class Renderer(Protocol):
 class SplatRenderer(ABC):
     """A renderer that draws in the splat frame: the camera is moved there, and depths come back in map units."""
 
-    def __init__(self, gaussian_map: GaussianMap) -> None:
+    def __init__(self, gaussian_map: GaussianMap, device: str = "cpu") -> None:
+        self.device = device
         self._map_scale = gaussian_map.S_map_splat.scale
         self._S_splat_map = gaussian_map.S_map_splat.inverse()
 

@@ -27,6 +27,7 @@ def enlarge(render: Render, width: int, height: int) -> Render:
     Colours and coverage are interpolated. So are the mean and the mean square of the depth: where near meets far,
     `depth_std` says so, as it does where both are seen in one pixel. No depth where one of the neighbours has none.
     """
+    render = render.on_host()
     # The mean square less the square of the mean would lose the spread to rounding in float32.
     depth = render.depth.astype(np.float64)
     mean = _interpolated(depth, width, height)

@@ -22,15 +22,17 @@ from gsfeatloc_ros.render.slabs import Slabs
 CHECK_MIN_PSNR = 50.0
 CHECK_MAX_DEPTH_ERROR = 1e-3
 _CHECK_CAMERA = Camera(80, 56, np.array([[60.0, 0, 43.0], [0, 64.0, 26.0], [0, 0, 1]]))
+# The upper triangle of a covariance, as gsplat takes it.
 _COVARIANCE = [
-    prepared_rows.XX, prepared_rows.XY, prepared_rows.XZ,
-    prepared_rows.XY, prepared_rows.YY, prepared_rows.YZ,
-    prepared_rows.XZ, prepared_rows.YZ, prepared_rows.ZZ,
+    prepared_rows.XX, prepared_rows.XY, prepared_rows.XZ, prepared_rows.YY, prepared_rows.YZ, prepared_rows.ZZ
 ]  # fmt: skip
+_TILE = 16  # pixels; gsplat says that no other size is tested
 
 
 class GpuRenderer(SplatRenderer):
-    """Rasterizer on a GPU, with the conventions and outputs of CpuRenderer but for one.
+    """Rasterizer on a GPU, with the conventions and outputs of CpuRenderer but for two.
+
+    Renders stay on the GPU, for matchers and trackers there; those enlarged (resolution_scale) come to the host.
 
     gsplat gives no median depth. It is estimated, to within some thousandths of the depth, from the moments of the
     depth in slabs (render/slabs.py); the mean and the spread are exact.
@@ -52,7 +54,7 @@ class GpuRenderer(SplatRenderer):
         """
         check_range("sh_degree", sh_degree, 0, len(SH_COEFFICIENTS) - 1)
         check_range("resolution_scale", resolution_scale, 0.1, 1.0)
-        super().__init__(gaussian_map)
+        super().__init__(gaussian_map, device)
         problem = self_check(device)
         if problem:
             raise RuntimeError(problem)
@@ -80,17 +82,17 @@ class _Splats:
         stored = prepared.sh.shape[1] // 3
         used = min(stored, SH_COEFFICIENTS[sh_degree])
         self._sh_degree = SH_COEFFICIENTS.index(used)
-        self._mode = "antialiased" if prepared.antialiased else "classic"
+        self._antialiased = prepared.antialiased
         self._background = torch.tensor(background, dtype=torch.float32, device=device)
         rows = torch.from_numpy(prepared.gaussians).to(device).transpose(1, 2).reshape(-1, prepared_rows.ROWS)
         # Those that fill up the last chunk have no opacity.
         seen = torch.isfinite(rows[:, prepared_rows.LOG_OPACITY])
         rows = rows[seen]
         self._means = rows[:, : prepared_rows.Z + 1].contiguous()
-        self._covariances = rows[:, _COVARIANCE].reshape(-1, 3, 3)
+        self._covariances = rows[:, _COVARIANCE]
         self._opacities = torch.exp2(rows[:, prepared_rows.LOG_OPACITY])
         sh = torch.from_numpy(prepared.sh[:, : 3 * used]).to(device).transpose(1, 2).reshape(-1, used, 3)
-        self._sh = sh[seen].float()
+        self._sh = sh[seen]  # in half precision
 
     @torch.no_grad()
     def draw(self, camera: Camera, T_splat_camera: np.ndarray) -> Render:
@@ -100,62 +102,71 @@ class _Splats:
         import gsplat
 
         device = self._means.device
-        # Relative to the camera, so that a map far from its origin loses no digits in gsplat's float32.
-        center = torch.from_numpy(T_splat_camera[:3, 3].copy())
-        origin = center.float()
-        offsets = self._means - origin.to(device) - (center - origin).float().to(device)
-        view = torch.eye(4)
-        view[:3, :3] = torch.from_numpy(T_splat_camera[:3, :3].T.copy())
-        K = torch.from_numpy(camera.K).float()
+        center = T_splat_camera[:3, 3]
+        origin = center.astype(np.float32)
+        view = np.eye(4)
+        view[:3, :3] = T_splat_camera[:3, :3].T
+        K = camera.K.copy()
         # gsplat counts pixels from the image's corner, half a pixel before the centre of the first.
-        K[:2, 2] = torch.from_numpy(camera.K[:2, 2] + 0.5)
-        rgb, alpha, splats = gsplat.rasterization(
+        K[:2, 2] += 0.5
+        # In one copy, for which the host does not wait.
+        numbers = np.concatenate([origin, center - origin, view.ravel(), K.ravel()]).astype(np.float32)
+        origin, rest, view, K = torch.from_numpy(numbers).to(device, non_blocking=True).split([3, 3, 16, 9])
+        # Relative to the camera, so that a map far from its origin loses no digits in gsplat's float32.
+        offsets = self._means - origin - rest
+        _, cameras, seen, radii, means2d, depths, conics, compensations = gsplat.fully_fused_projection(
             means=offsets,
+            covars=self._covariances,
             quats=None,
             scales=None,
-            opacities=self._opacities,
-            colors=self._sh,
-            viewmats=view[None].to(device),
-            Ks=K[None].to(device),
+            viewmats=view.view(1, 4, 4),
+            Ks=K.view(1, 3, 3),
             width=camera.width,
             height=camera.height,
-            near_plane=NEAR_PLANE,
             eps2d=EPS2D,
-            sh_degree=self._sh_degree,
+            near_plane=NEAR_PLANE,
             packed=True,
-            rasterize_mode=self._mode,
-            covars=self._covariances,
+            calc_compensations=self._antialiased,
+            opacities=self._opacities,
         )
-        if len(splats["depths"]) == 0:
+        if len(seen) == 0:
             return self._nothing(camera)
-
-        # The same splats once more, with the moments of their depths for colours.
-        slabs = Slabs.of(splats["depths"], splats["radii"].long().clamp(max=max(camera.width, camera.height)).prod(1))
-        moments, _ = gsplat.rasterize_to_pixels(
-            splats["means2d"],
-            splats["conics"],
-            slabs.channels(splats["depths"]),
-            splats["opacities"],
+        opacities = self._opacities[seen]
+        if self._antialiased:
+            opacities = opacities * compensations
+        colors = gsplat.spherical_harmonics(
+            degrees_to_use=self._sh_degree, dirs=offsets[seen], coeffs=self._sh[seen].float()
+        )
+        columns, rows = (-(-size // _TILE) for size in (camera.width, camera.height))
+        _, isect_ids, flatten_ids = gsplat.isect_tiles(
+            means2d, radii, depths, _TILE, columns, rows, packed=True, n_images=1, image_ids=cameras, gaussian_ids=seen
+        )
+        slabs = Slabs.of(depths, radii.long().clamp(max=max(camera.width, camera.height)).prod(1))
+        # Colours and moments of the depth in one pass; 33 channels are one of the numbers that gsplat has kernels for.
+        blended, alpha = gsplat.rasterize_to_pixels(
+            means2d,
+            conics,
+            torch.cat([(colors + 0.5).clamp(min=0.0), slabs.channels(depths)], dim=1),
+            opacities,
             camera.width,
             camera.height,
-            splats["tile_size"],
-            splats["isect_offsets"],
-            splats["flatten_ids"],
+            _TILE,
+            gsplat.isect_offset_encode(isect_ids, 1, columns, rows),
+            flatten_ids,
             packed=True,
         )
         # Here and not by gsplat, which in 1.5.3 takes no background of packed splats.
-        rgb = rgb[0] + (1.0 - alpha[0]) * self._background
+        rgb = blended[0, ..., :3] + (1.0 - alpha[0]) * self._background
         alpha = alpha[0, ..., 0]
-        depths = slabs.statistics(moments[0])
-        for image in depths:
-            image[alpha < DEPTH_MIN_ALPHA] = torch.nan
-        return Render(*(image.cpu().numpy() for image in (rgb.clamp(max=1.0), *depths, alpha)))
+        bare = alpha < DEPTH_MIN_ALPHA
+        depths = (image.masked_fill(bare, torch.nan) for image in slabs.statistics(blended[0, ..., 3:]))
+        return Render(rgb.clamp(max=1.0), *depths, alpha)
 
     def _nothing(self, camera: Camera) -> Render:
-        shape = (camera.height, camera.width)
-        rgb = np.broadcast_to(self._background.cpu().numpy(), (*shape, 3)).copy()
-        depth, median_depth, depth_std = (np.full(shape, np.nan, dtype=np.float32) for _ in range(3))
-        return Render(rgb, depth, median_depth, depth_std, np.zeros(shape, dtype=np.float32))
+        shape, device = (camera.height, camera.width), self._means.device
+        rgb = self._background.expand(*shape, 3).clone()
+        depths = (torch.full(shape, torch.nan, device=device) for _ in range(3))
+        return Render(rgb, *depths, torch.zeros(shape, device=device))
 
 
 @functools.cache
@@ -164,7 +175,7 @@ def self_check(device: str) -> str:
     try:
         for antialiased in (False, True):
             gaussian_map = _check_map(antialiased)
-            gpu = _Splats(gaussian_map, (0.2, 0.4, 0.6), 3, device).draw(_CHECK_CAMERA, np.eye(4))
+            gpu = _Splats(gaussian_map, (0.2, 0.4, 0.6), 3, device).draw(_CHECK_CAMERA, np.eye(4)).on_host()
             cpu = CpuRenderer(gaussian_map, background=(0.2, 0.4, 0.6))._draw(_CHECK_CAMERA, np.eye(4))
             difference = _difference(gpu, cpu)
             if difference:

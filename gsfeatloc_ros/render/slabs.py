@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import torch
 
-# Each takes three channels, and beyond 32 channels gsplat becomes slow.
+# Each takes three channels; with those of the colour there are 33, a number that gsplat has a kernel for.
 SLABS = 10
 
 
@@ -69,4 +69,8 @@ class Slabs:
         deviation = torch.sqrt((second / weight - local * local).clamp(min=0.0))
         place = ((half[..., 0] - up_to) / weight + 1.0).clamp(0.0, 1.0)  # 0 at the near side of the slab, 1 at the far
         median = self.centers[slab[..., 0]] + local + math.sqrt(3) * deviation * (2.0 * place - 1.0)
+        # Depths that are far apart in a slab can have a deviation that leads out of it.
+        nearest = torch.cat([self.edges.new_zeros(1), self.edges])[slab[..., 0]]
+        farthest = torch.cat([self.edges, self.edges.new_full((1,), torch.inf)])[slab[..., 0]]
+        median = torch.minimum(torch.maximum(median, nearest), farthest)
         return mean, median, torch.sqrt(variance.clamp(min=0.0))

@@ -11,39 +11,42 @@ import math
 import torch
 from torch import Tensor
 
+__all__ = [
+    "fully_fused_projection",
+    "isect_offset_encode",
+    "isect_tiles",
+    "rasterize_to_pixels",
+    "spherical_harmonics",
+]
 
-def rasterization(
+
+def fully_fused_projection(
     means: Tensor,
-    quats: Tensor | None,
-    scales: Tensor | None,
-    opacities: Tensor,
-    colors: Tensor,
+    covars: Tensor,
+    quats: None,
+    scales: None,
     viewmats: Tensor,
     Ks: Tensor,
     width: int,
     height: int,
-    near_plane: float = 0.01,
     eps2d: float = 0.3,
-    sh_degree: int | None = None,
-    packed: bool = True,
-    tile_size: int = 16,
-    rasterize_mode: str = "classic",
+    near_plane: float = 0.01,
+    packed: bool = False,
+    calc_compensations: bool = False,
     *,
-    covars: Tensor,
-) -> tuple[Tensor, Tensor, dict]:
+    opacities: Tensor,
+) -> tuple[Tensor, ...]:
     count = len(means)
     assert count > 0  # the real one divides by it
     assert quats is None
     assert scales is None
     assert packed
     assert means.shape == (count, 3)
-    assert covars.shape == (count, 3, 3)
+    assert covars.shape == (count, 6)
     assert opacities.shape == (count,)
-    assert colors.shape == (count, colors.shape[1], 3)
-    assert (sh_degree + 1) ** 2 <= colors.shape[1]
     assert viewmats.shape == (1, 4, 4)
     assert Ks.shape == (1, 3, 3)
-    for tensor in (means, covars, opacities, colors, viewmats, Ks):
+    for tensor in (means, covars, opacities, viewmats, Ks):
         assert tensor.dtype == torch.float32  # the kernels read nothing else
 
     world_to_camera, K = viewmats[0].double(), Ks[0].double()
@@ -58,47 +61,74 @@ def rasterization(
     J = torch.zeros(count, 2, 3, dtype=torch.float64)
     J[:, 0, 0], J[:, 0, 2] = fx / z, -fx * slope_x / z
     J[:, 1, 1], J[:, 1, 2] = fy / z, -fy * slope_y / z
-    sharp = J @ R @ covars.double() @ R.T @ J.mT
+    upper_triangle = torch.tensor([0, 1, 2, 1, 3, 4, 2, 4, 5])
+    covariances = covars.double()[:, upper_triangle].reshape(-1, 3, 3)
+    sharp = J @ R @ covariances @ R.T @ J.mT
     blurred = sharp + eps2d * torch.eye(2, dtype=torch.float64)
-    seen_opacities = opacities.double()
-    if rasterize_mode == "antialiased":
-        seen_opacities = seen_opacities * (sharp.det() / blurred.det()).clamp(min=0.0).sqrt()
-    else:
-        assert rasterize_mode == "classic"
+    compensations = (sharp.det() / blurred.det()).clamp(min=0.0).sqrt()
+    seen_opacities = opacities.double() * (compensations if calc_compensations else 1.0)
     deviations = torch.sqrt(2 * torch.log((255 * seen_opacities).clamp(min=1.0)))
     radii = torch.ceil(deviations[:, None] * blurred.diagonal(dim1=1, dim2=2).sqrt())
     size = torch.tensor([width, height])
     inside = ((centers + radii > 0) & (centers - radii < size)).all(1)
     ids = torch.nonzero(in_front & (seen_opacities >= 1 / 255) & (radii > 0).any(1) & inside).ravel()
-
-    camera_center = -R.T @ t
-    harmonics = (
-        _harmonics(sh_degree, means[ids].double() - camera_center) @ colors[ids, : (sh_degree + 1) ** 2].double()
-    )
     inverse = blurred[ids].inverse()
-    meta = {
-        "gaussian_ids": ids,
-        "radii": radii[ids].int(),
-        "means2d": centers[ids].float(),
-        "depths": z[ids].float(),
-        "conics": torch.stack([inverse[:, 0, 0], inverse[:, 0, 1], inverse[:, 1, 1]], 1).float(),
-        "opacities": seen_opacities[ids].float(),
-        "tile_size": tile_size,
-    }
-    meta["isect_offsets"], meta["flatten_ids"] = _tile_lists(meta, width, height)
-    rgb, alphas = rasterize_to_pixels(
-        meta["means2d"],
-        meta["conics"],
-        (harmonics[:, 0] + 0.5).clamp(min=0.0).float(),
-        meta["opacities"],
-        width,
-        height,
-        tile_size,
-        meta["isect_offsets"],
-        meta["flatten_ids"],
-        packed=True,
+    return (
+        torch.zeros_like(ids),
+        torch.zeros_like(ids),
+        ids,
+        radii[ids].int(),
+        centers[ids].float(),
+        z[ids].float(),
+        torch.stack([inverse[:, 0, 0], inverse[:, 0, 1], inverse[:, 1, 1]], 1).float(),
+        compensations[ids].float() if calc_compensations else None,
     )
-    return rgb, alphas, meta
+
+
+def spherical_harmonics(degrees_to_use: int, dirs: Tensor, coeffs: Tensor) -> Tensor:
+    count = len(dirs)
+    assert dirs.shape == (count, 3)
+    assert coeffs.shape == (count, coeffs.shape[1], 3)
+    assert (degrees_to_use + 1) ** 2 <= coeffs.shape[1]
+    assert dirs.dtype == coeffs.dtype == torch.float32
+    used = coeffs[:, : (degrees_to_use + 1) ** 2].double()
+    return (_harmonics(degrees_to_use, dirs.double()) @ used)[:, 0].float()
+
+
+def isect_tiles(
+    means2d: Tensor,
+    radii: Tensor,
+    depths: Tensor,
+    tile_size: int,
+    tile_width: int,
+    tile_height: int,
+    packed: bool = False,
+    *,
+    n_images: int,
+    image_ids: Tensor,
+    gaussian_ids: Tensor,
+) -> tuple[Tensor, Tensor, Tensor]:
+    assert packed
+    assert n_images == 1
+    assert image_ids.shape == gaussian_ids.shape == depths.shape
+    assert image_ids.dtype == gaussian_ids.dtype == torch.int64
+    by_depth = torch.argsort(depths, stable=True)
+    low = ((means2d - radii) / tile_size).floor()[by_depth]
+    high = ((means2d + radii) / tile_size).ceil()[by_depth]
+    tile_ids, flatten_ids = [], []
+    for row in range(tile_height):
+        for column in range(tile_width):
+            tile = torch.tensor([column, row])
+            flatten_ids.append(by_depth[((low <= tile) & (tile < high)).all(1)])
+            tile_ids.append(torch.full_like(flatten_ids[-1], row * tile_width + column))
+    tile_ids, flatten_ids = torch.cat(tile_ids), torch.cat(flatten_ids)
+    isect_ids = tile_ids << 32 | depths[flatten_ids].view(torch.int32).long()
+    return torch.bincount(flatten_ids, minlength=len(depths)).int(), isect_ids, flatten_ids.int()
+
+
+def isect_offset_encode(isect_ids: Tensor, n_images: int, tile_width: int, tile_height: int) -> Tensor:
+    tiles = torch.arange(tile_height * tile_width)
+    return torch.searchsorted(isect_ids >> 32, tiles).reshape(n_images, tile_height, tile_width).int()
 
 
 def rasterize_to_pixels(
@@ -145,22 +175,6 @@ def rasterize_to_pixels(
         alphas[box] = weights.sum(-1, keepdim=True)
     assert isect_offsets.shape[1:] == (math.ceil(image_height / tile_size), math.ceil(image_width / tile_size))
     return image.float(), alphas.float()
-
-
-def _tile_lists(meta: dict, width: int, height: int) -> tuple[Tensor, Tensor]:
-    """Offsets (1, rows, columns) of the tiles' lists, and the lists one after another, each from near to far."""
-    size = meta["tile_size"]
-    by_depth = torch.argsort(meta["depths"], stable=True)
-    low = ((meta["means2d"] - meta["radii"]) / size).floor()[by_depth]
-    high = ((meta["means2d"] + meta["radii"]) / size).ceil()[by_depth]
-    rows, columns = math.ceil(height / size), math.ceil(width / size)
-    lists = []
-    for row in range(rows):
-        for column in range(columns):
-            tile = torch.tensor([column, row])
-            lists.append(by_depth[((low <= tile) & (tile < high)).all(1)])
-    lengths = torch.tensor([0, *(len(ids) for ids in lists)])
-    return lengths.cumsum(0)[:-1].reshape(1, rows, columns).int(), torch.cat(lists).int()
 
 
 def _harmonics(degree: int, directions: Tensor) -> Tensor:
