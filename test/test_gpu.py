@@ -1,14 +1,16 @@
 """The GPU renderer: what it asks of gsplat, against the slow reference, and what is said where it cannot run.
 
 Without a GPU a stand-in for gsplat is drawn with, by gsplat's documentation, on the CPU (stand_in/gsplat.py). That
-shows what this package makes of poses, cameras, harmonics and depths; not that gsplat does as documented. With a GPU
-and gsplat the last tests show that.
+shows what this package makes of poses, cameras, harmonics and depths; not that gsplat does as documented. `make gsplat`
+shows that: it puts gsplat's own kernels, compiled for the CPU (cuda_on_cpu/), in the stand-in's place. With a GPU and
+gsplat the last tests show that it does so there.
 """
 
 from __future__ import annotations
 
 import importlib.util
 import logging
+import os
 import subprocess
 import sys
 import threading
@@ -21,6 +23,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 import torch
+from cuda_on_cpu.gsplat_on_cpu import import_on_cpu
 from hypothesis import given
 from hypothesis import strategies as st
 from stand_in.gpu import as_kernel, simulated_gpu
@@ -38,6 +41,11 @@ from gsfeatloc_ros.render.reference import ReferenceRenderer
 from gsfeatloc_ros.render.slabs import Slabs
 
 STAND_IN = Path(__file__).parent / "stand_in" / "gsplat.py"
+# Where gsplat is installed whose kernels are to be drawn with on the CPU.
+GSPLAT_ON_CPU = os.environ.get("GSPLAT_ON_CPU")
+FUNCTIONS = (
+    "fully_fused_projection", "isect_offset_encode", "isect_tiles", "rasterize_to_pixels", "spherical_harmonics",
+)  # fmt: skip
 POSE = make_pose(so3_exp(np.array([0.2, -0.3, 0.1])), np.array([0.3, -0.2, 0.5]))
 BACKGROUND = (0.2, 0.4, 0.6)
 on_gpu = pytest.mark.skipif(
@@ -52,10 +60,13 @@ def forget() -> None:
 
 @pytest.fixture
 def gsplat(monkeypatch) -> ModuleType:
-    """The stand-in, in place of gsplat."""
-    spec = importlib.util.spec_from_file_location("gsplat", STAND_IN)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    """The stand-in, in place of gsplat, or gsplat itself on the CPU."""
+    if GSPLAT_ON_CPU:
+        module = import_on_cpu(Path(GSPLAT_ON_CPU))
+    else:
+        spec = importlib.util.spec_from_file_location("gsplat", STAND_IN)
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
     monkeypatch.setitem(sys.modules, "gsplat", module)
     forget()
     yield module
@@ -201,7 +212,7 @@ def test_threads_get_the_same_pictures(gsplat) -> None:
 
 
 def test_a_render_is_made_and_stays_on_the_gpu(gsplat, monkeypatch) -> None:
-    for name in gsplat.__all__:
+    for name in FUNCTIONS:
         monkeypatch.setattr(gsplat, name, as_kernel(getattr(gsplat, name)))
     gaussian_map = random_map(150, 1, seed=0)
     with simulated_gpu() as gpu:

@@ -83,6 +83,8 @@ def test_no_picture_leaves_the_gpu_before_the_pose_is_solved(
     estimate = localizer.localize(query.image, room_camera, query.T_map_camera_prior)
     assert estimate.status is Status.LOCALIZED
     assert 0 < max(left) <= SMALL
+    # The photo's corners; of the render at the prior and of those at estimates, matches and the depths under them.
+    assert sum(size > 100 for size in left) == 1 + 2 * (1 + estimate.passes)
     # The judge compares pictures, on the host.
     assert max(gpu.to_host) > SMALL
 

@@ -8,7 +8,7 @@ from typing import Protocol, TypeVar
 
 import numpy as np
 
-from gsfeatloc_ros.arrays import Array, to_host
+from gsfeatloc_ros.arrays import Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,12 +54,6 @@ class Matches:
     def select(self, kept: np.ndarray) -> Matches:
         """The matches that a mask (M,) or indices name."""
         return Matches(self.a[kept], self.b[kept], self.scores[kept])
-
-    @staticmethod
-    def from_indices(a: Features, b: Features, index_a: Array, index_b: Array, scores: Array) -> Matches:
-        """Matches between the features `index_a` (M,) of `a` and `index_b` (M,) of `b`."""
-        numbers = (a.keypoints[index_a], b.keypoints[index_b], scores)
-        return Matches(*(to_host(array).astype(np.float64) for array in numbers))
 
     @staticmethod
     def none() -> Matches:

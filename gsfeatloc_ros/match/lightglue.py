@@ -15,6 +15,7 @@ from kornia.feature import LightGlue
 
 from gsfeatloc_ros.arrays import Array
 from gsfeatloc_ros.match.base import Extractor, Features, Matches
+from gsfeatloc_ros.match.tensor import to_matches
 from gsfeatloc_ros.match.weights import Weights, WeightsError, fill
 
 
@@ -91,7 +92,7 @@ class LightGlueMatcher:
             return Matches.none()
         found = self._network({"image0": _network_input(a), "image1": _network_input(b)})
         index_a, index_b = found["matches"][0].T
-        return Matches.from_indices(a, b, index_a, index_b, found["scores"][0])
+        return to_matches(a, b, index_a, index_b, found["scores"][0])
 
 
 def _current(name: str) -> str:

@@ -17,7 +17,7 @@ from gsfeatloc_ros.arrays import Array
 from gsfeatloc_ros.match.base import Matches
 from gsfeatloc_ros.match.lightglue import PlacedFeatures
 from gsfeatloc_ros.match.peaks import cell_heatmap, centroid
-from gsfeatloc_ros.match.tensor import to_tensor
+from gsfeatloc_ros.match.tensor import to_matches, to_tensor
 from gsfeatloc_ros.match.weights import WeightsError
 
 _log = logging.getLogger(__name__)
@@ -96,7 +96,7 @@ class SuperPointMatcher:
         matches, matching_scores = self._network._match_image_pair(*inputs, height, width, mask=mask)[:2]
         index_b = matches.reshape(2, -1)[0, : len(a)]
         index_a = (index_b >= 0).nonzero().ravel()
-        return Matches.from_indices(a, b, index_a, index_b[index_a], matching_scores.reshape(2, -1)[0, index_a])
+        return to_matches(a, b, index_a, index_b[index_a], matching_scores.reshape(2, -1)[0, index_a])
 
 
 def _pair(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:

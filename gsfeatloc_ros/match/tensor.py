@@ -1,10 +1,11 @@
-"""Images as the networks take them."""
+"""Images as the networks take them, and matches as they give them."""
 
 from __future__ import annotations
 
 import torch
 
 from gsfeatloc_ros.arrays import Array
+from gsfeatloc_ros.match.base import Features, Matches
 
 
 def is_blank(image: Array) -> bool:
@@ -21,3 +22,11 @@ def to_tensor(image: Array, device: str, multiple: int = 1) -> torch.Tensor:
     tensor = torch.as_tensor(image).to(device).permute(2, 0, 1)[None].float() / 255.0
     height, width = image.shape[:2]
     return torch.nn.functional.pad(tensor, (0, -width % multiple, 0, -height % multiple), mode="replicate")
+
+
+def to_matches(a: Features, b: Features, index_a: torch.Tensor, index_b: torch.Tensor, scores: torch.Tensor) -> Matches:
+    """Matches between the features `index_a` (M,) of `a` and `index_b` (M,) of `b`, with scores (M,)."""
+    # In one copy, as each waits for the device.
+    columns = torch.column_stack([a.keypoints[index_a], b.keypoints[index_b], scores])
+    numbers = columns.cpu().double().numpy()
+    return Matches(numbers[:, :2], numbers[:, 2:4], numbers[:, 4])

@@ -262,7 +262,9 @@ def _filter_matrix(size: int, kernel: np.ndarray, stride: int) -> np.ndarray:
 
 def _filtered(image: torch.Tensor, kernels: torch.Tensor) -> torch.Tensor:
     """An image (H, W) filtered with each of the K 3x3 kernels (K, 1, 3, 3): (1, K, H, W)."""
-    return conv2d(pad(image[None, None], (1, 1, 1, 1), mode="replicate"), kernels)
+    padded = pad(image[None, None], (1, 1, 1, 1), mode="replicate")
+    # With as many groups as channels torch convolves in full float32, where cuDNN would round to TF32.
+    return conv2d(padded.expand(-1, len(kernels), -1, -1), kernels, groups=len(kernels))
 
 
 def _least_eigenvalue(xx: torch.Tensor, xy: torch.Tensor, yy: torch.Tensor) -> torch.Tensor:

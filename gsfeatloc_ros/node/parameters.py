@@ -148,7 +148,9 @@ PARAMETERS = (
         "Path of a learned matcher's weights (two networks: of their folder); empty looks in the usual places.",
     ),
     Parameter("matcher.max_features", DEFAULT_MAX_FEATURES, "Most features taken from an image.", (64, 32768)),
-    Parameter("renderer.device", "auto", "Where to render: cpu, cuda, or auto to choose.", choices=DEVICES),
+    Parameter(
+        "renderer.device", "auto", "Where to render, match and track: cpu, cuda, or auto to choose.", choices=DEVICES
+    ),
     Parameter("renderer.threads", 0, "Threads of the CPU renderer; 0 takes all cores.", (0, 1024)),
     Parameter("renderer.sh_degree", 3, "Highest degree of the spherical harmonics of the colours drawn.", (0, 3)),
     Parameter(

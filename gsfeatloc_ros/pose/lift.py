@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsfeatloc_ros.arrays import to_host
 from gsfeatloc_ros.camera import Camera
 from gsfeatloc_ros.geometry import transform
 from gsfeatloc_ros.render.base import Render
@@ -52,11 +51,7 @@ def lift(render: Render, camera: Camera, T_map_camera: np.ndarray, pixels: np.nd
     fx, fy = np.clip(x - column, 0, 1), np.clip(y - row, 0, 1)
     weights = np.stack([(1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy], axis=1)
 
-    # (M, 4) each, NaN where there is none; of a render on a GPU only these come to the host.
-    depths, depth_stds, alphas = (
-        to_host(picture[rows, columns]).astype(np.float64)
-        for picture in (render.median_depth, render.depth_std, render.alpha)
-    )
+    depths, depth_stds, alphas = _sampled(render, rows, columns)  # (M, 4) each, NaN where there is none
     depth = (weights * depths).sum(axis=1)
     depth_std = np.minimum((weights * depth_stds).sum(axis=1), MAX_DEPTH_STD * depth)
     # Comparisons with NaN are false: what has no depth is not valid.
@@ -68,3 +63,15 @@ def lift(render: Render, camera: Camera, T_map_camera: np.ndarray, pixels: np.nd
     points = transform(T_map_camera, rays * depth[:, None])
     sigmas = (rays * (DEPTH_SIGMA_PER_STD * depth_std)[:, None]) @ T_map_camera[:3, :3].T
     return Lifted(points, np.where(valid[:, None], sigmas, np.nan), valid)
+
+
+def _sampled(render: Render, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """Median depth, its spread and alpha at pixels: (3, ...) float64, all of the render that comes to the host."""
+    pictures = (render.median_depth, render.depth_std, render.alpha)
+    if isinstance(render.alpha, np.ndarray):
+        return np.stack([picture[rows, columns] for picture in pictures]).astype(np.float64)
+    import torch
+
+    # In one copy each way.
+    pixels = torch.from_numpy(rows * render.alpha.shape[1] + columns).to(render.alpha.device, non_blocking=True)
+    return torch.stack([picture.flatten()[pixels] for picture in pictures]).cpu().double().numpy()

@@ -186,7 +186,8 @@ def self_check(device: str) -> str:
     except Exception as error:  # whatever it is, gsplat cannot be used, and the caller is to hear why
         return (
             f"gsplat does not work on this machine ({type(error).__name__}: {error}): it builds itself when first "
-            "used, with g++ and the CUDA toolkit (nvcc) of the version that torch is built for"
+            "used, with g++ and the CUDA toolkit of the version that torch is built for; nvcc and ninja must be on the "
+            "PATH then and later"
         )
     return ""
 

@@ -11,14 +11,6 @@ import math
 import torch
 from torch import Tensor
 
-__all__ = [
-    "fully_fused_projection",
-    "isect_offset_encode",
-    "isect_tiles",
-    "rasterize_to_pixels",
-    "spherical_harmonics",
-]
-
 
 def fully_fused_projection(
     means: Tensor,
