@@ -79,8 +79,10 @@ def test_no_picture_leaves_the_gpu_before_the_pose_is_solved(
 
     monkeypatch.setattr(localizer, "_judge", note_what_left_until_now)
     query = room_queries[0]
+    image = query.image.copy()
+    image.flags.writeable = False  # as those of messages
     gpu.reset()
-    estimate = localizer.localize(query.image, room_camera, query.T_map_camera_prior)
+    estimate = localizer.localize(image, room_camera, query.T_map_camera_prior)
     assert estimate.status is Status.LOCALIZED
     assert 0 < max(left) <= SMALL
     # The photo's corners; of the render at the prior and of those at estimates, matches and the depths under them.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import cv2
 import numpy as np
 import pytest
@@ -11,11 +13,16 @@ from hypothesis import strategies as st
 from gsfeatloc_ros.camera import Camera
 from gsfeatloc_ros.geometry import invert, make_pose, so3_exp, transform
 from gsfeatloc_ros.match.track import CornerTracker
+from gsfeatloc_ros.match.track_gpu import GpuCornerTracker
 from gsfeatloc_ros.photo import Photo
 from gsfeatloc_ros.pose.acceptance import agreeing_share
 from gsfeatloc_ros.render import create_renderer
 from gsfeatloc_ros.structure import local_structure
 
+# What both trackers must do; that for GPUs here on torch's CPU.
+both_trackers = pytest.mark.parametrize(
+    "tracker_of", [CornerTracker, partial(GpuCornerTracker, device="cpu")], ids=["for CPUs", "for GPUs"]
+)
 CAMERA = Camera(160, 120, np.array([[150.0, 0, 79.5], [0, 150.0, 59.5], [0, 0, 1]]))
 
 
@@ -31,23 +38,27 @@ def textured(seed: int, height: int = 120, width: int = 160) -> np.ndarray:
     return np.clip(128 + 40 * sum(layers), 0, 255).astype(np.uint8)
 
 
+@both_trackers
 @settings(deadline=None, max_examples=20)
 @given(seed=st.integers(0, 1000), dx=st.floats(-6, 6), dy=st.floats(-6, 6))
-def test_corners_of_a_moved_picture_are_found_to_a_tenth_of_a_pixel(seed: int, dx: float, dy: float) -> None:
+def test_corners_of_a_moved_picture_are_found_to_a_tenth_of_a_pixel(
+    tracker_of, seed: int, dx: float, dy: float
+) -> None:
     image = textured(seed)
     moved = cv2.warpAffine(image, np.array([[1, 0, dx], [0, 1, dy]]), (160, 120), flags=cv2.INTER_CUBIC)
-    matches = CornerTracker(photo_of(image)).track(moved)
+    matches = tracker_of(photo_of(image)).track(moved)
     assert len(matches) > 30
     assert np.median(np.linalg.norm(matches.b - matches.a - [dx, dy], axis=1)) < 0.1
 
 
-def test_corners_are_found_in_renders_near_the_photo(room_map, room_camera, room_queries) -> None:
+@both_trackers
+def test_corners_are_found_in_renders_near_the_photo(tracker_of, room_map, room_camera, room_queries) -> None:
     """The truth is the geometry: the corner's point of the room, seen from the other pose."""
     query = room_queries[0]
     photo = Photo.undistorted(query.image, room_camera, 640)
     near = query.T_map_camera @ make_pose(so3_exp(np.radians([0.4, -0.5, 0.3])), np.array([0.02, 0.01, -0.01]))
-    renderer = create_renderer(room_map)
-    matches = CornerTracker(photo).track(renderer.render(photo.camera, near).image())
+    renderer = create_renderer(room_map, "cpu")
+    matches = tracker_of(photo).track(renderer.render(photo.camera, near).image())
     assert len(matches) > 100
     columns, rows = np.rint(matches.a).astype(int).T
     depth = renderer.render(photo.camera, query.T_map_camera).median_depth[rows, columns].astype(np.float64)
@@ -57,37 +68,41 @@ def test_corners_are_found_in_renders_near_the_photo(room_map, room_camera, room
     assert np.nanmean(errors < 3) > 0.85
 
 
+@both_trackers
 @pytest.mark.parametrize(("gain", "least", "error"), [(0.4, 0.4, 0.5), (0.7, 0.7, 0.2), (1.3, 0.8, 0.2)])
-def test_todays_light_does_not_count(gain: float, least: float, error: float) -> None:
+def test_todays_light_does_not_count(tracker_of, gain: float, least: float, error: float) -> None:
     image = textured(3)
     ramp = np.linspace(0.6, 1.0, 160)[None, :, None]
     lit = np.clip(gain * ramp * image, 0, 255).astype(np.uint8)
-    matches = CornerTracker(photo_of(image)).track(lit)
-    assert len(matches) > least * len(CornerTracker(photo_of(image)).corners)
+    matches = tracker_of(photo_of(image)).track(lit)
+    assert len(matches) > least * len(tracker_of(photo_of(image)).corners)
     assert np.median(np.linalg.norm(matches.b - matches.a, axis=1)) < error
 
 
-def test_what_is_not_there_is_not_found() -> None:
-    tracker = CornerTracker(photo_of(textured(1)))
+@both_trackers
+def test_what_is_not_there_is_not_found(tracker_of) -> None:
+    tracker = tracker_of(photo_of(textured(1)))
     assert len(tracker.track(textured(2))) < 0.2 * len(tracker.corners)
 
 
+@both_trackers
 @pytest.mark.parametrize("value", [0, 128, 255])
-def test_blank_pictures_have_no_corners(value: int) -> None:
+def test_blank_pictures_have_no_corners(tracker_of, value: int) -> None:
     blank = np.full((120, 160, 3), value, np.uint8)
-    tracker = CornerTracker(photo_of(blank))
+    tracker = tracker_of(photo_of(blank))
     assert len(tracker.corners) == 0
     assert len(tracker.track(textured(0))) == 0
-    found = CornerTracker(photo_of(textured(0))).track(blank)
+    found = tracker_of(photo_of(textured(0))).track(blank)
     assert np.isfinite(found.b).all()
 
 
-def test_the_border_of_what_the_lens_saw_is_no_corner() -> None:
+@both_trackers
+def test_the_border_of_what_the_lens_saw_is_no_corner(tracker_of) -> None:
     pincushion = Camera(160, 120, CAMERA.K, np.array([0.9, 0.0, 0.0, 0.0]))
     photo = Photo.undistorted(np.full((120, 160, 3), 200, np.uint8), pincushion, 160)
     assert 0.1 < photo.seen.mean() < 0.95
     assert (photo.image[~photo.seen] < 200).any()
-    assert len(CornerTracker(photo).corners) == 0
+    assert len(tracker_of(photo).corners) == 0
 
 
 @pytest.mark.parametrize("model", ["plumb_bob", "equidistant"])

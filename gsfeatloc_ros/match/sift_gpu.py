@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch.nn import functional
 
-from gsfeatloc_ros.arrays import Array
+from gsfeatloc_ros.arrays import Array, to_device
 from gsfeatloc_ros.match.base import Features, Matches
 from gsfeatloc_ros.match.nearest import match_mutual
 from gsfeatloc_ros.match.sift import CONTRAST_THRESHOLD, MAX_RATIO
@@ -124,7 +124,7 @@ class _Atlas:
             strides,
             2 / (np.array([shape[1], _LAYERS * shape[0]], np.float32) - 1),
         )
-        return _Atlas(shape, slices, *(torch.from_numpy(array).to(device) for array in arrays))
+        return _Atlas(shape, slices, *(to_device(array, device) for array in arrays))
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,7 +180,7 @@ class GpuSift:
         atlas = self._atlas(*image.shape[:2])
         if not atlas.slices:
             return self._none()
-        gray = torch.as_tensor(image).to(self._device).float() @ self._luma
+        gray = to_device(image, self._device).float() @ self._luma
         gaussians = self._gaussians(gray, atlas)
         keypoints = self._find(gaussians[1:] - gaussians[:-1], atlas)
         gradients = _gradients(gaussians[1 : _LAYERS + 1], atlas)

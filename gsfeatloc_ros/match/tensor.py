@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from gsfeatloc_ros.arrays import Array
+from gsfeatloc_ros.arrays import Array, to_device
 from gsfeatloc_ros.match.base import Features, Matches
 
 
@@ -19,7 +19,7 @@ def to_tensor(image: Array, device: str, multiple: int = 1) -> torch.Tensor:
     H' and W' are the next multiples of `multiple`. The image is padded at the bottom and right, not resized: pixels
     stay where they are, and a resampled image has weaker features.
     """
-    tensor = torch.as_tensor(image).to(device).permute(2, 0, 1)[None].float() / 255.0
+    tensor = to_device(image, device).permute(2, 0, 1)[None].float() / 255.0
     height, width = image.shape[:2]
     return torch.nn.functional.pad(tensor, (0, -width % multiple, 0, -height % multiple), mode="replicate")
 

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch.nn.functional import avg_pool2d, conv2d, grid_sample, max_pool2d, pad
 
-from gsfeatloc_ros.arrays import Array
+from gsfeatloc_ros.arrays import Array, to_device
 from gsfeatloc_ros.match.base import Matches
 from gsfeatloc_ros.match.track import (
     CORNER_BLOCK,
@@ -63,10 +63,10 @@ class GpuCornerTracker:
         self._constants = _constants(*photo.seen.shape, device)
         with torch.inference_mode():
             gray = self._constants.gray(photo.image)
-            seen = self._constants.to_device(seen_off_the_border(photo))
+            seen = to_device(seen_off_the_border(photo), device)
             self.corners = _find_corners(gray, seen, self._constants.sobel)
             if len(self.corners) > 0:
-                self._pixels = self._constants.to_device(self.corners)
+                self._pixels = to_device(self.corners, device)
                 self._pyramid = self._constants.pyramid(gray)
                 self._templates = [level.templates(self._pixels) for level in self._pyramid]
 
@@ -207,13 +207,9 @@ class _Constants:
             height, width = (height + 1) // 2, (width + 1) // 2
             self._scales.append(self._scale(height, width, 2 ** len(self._scales)))
 
-    def to_device(self, array: Array) -> torch.Tensor:
-        # The host goes on while it is copied; torch has read arrays that are not pinned when it returns.
-        return torch.as_tensor(array).to(self._device, non_blocking=True)
-
     def gray(self, image: Array) -> torch.Tensor:
         """Brightness (H, W), whole numbers as OpenCV's, of an RGB image (H, W, 3) uint8."""
-        return (self.to_device(image).float() @ self._luma).round()
+        return (to_device(image, self._device).float() @ self._luma).round()
 
     def pyramid(self, gray: torch.Tensor) -> list[_Level]:
         """The local structure (structure.py) of brightness (H, W), and its halvings."""

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gsfeatloc_ros.arrays import to_device
 from gsfeatloc_ros.camera import Camera
 from gsfeatloc_ros.geometry import transform
 from gsfeatloc_ros.render.base import Render
@@ -73,5 +74,5 @@ def _sampled(render: Render, rows: np.ndarray, columns: np.ndarray) -> np.ndarra
     import torch
 
     # In one copy each way.
-    pixels = torch.from_numpy(rows * render.alpha.shape[1] + columns).to(render.alpha.device, non_blocking=True)
+    pixels = to_device(rows * render.alpha.shape[1] + columns, render.alpha.device)
     return torch.stack([picture.flatten()[pixels] for picture in pictures]).cpu().double().numpy()

@@ -8,6 +8,7 @@ import threading
 import numpy as np
 import torch
 
+from gsfeatloc_ros.arrays import to_device
 from gsfeatloc_ros.camera import Camera
 from gsfeatloc_ros.maps.gaussian_map import SH_COEFFICIENTS, GaussianMap
 from gsfeatloc_ros.render import prepare as prepared_rows
@@ -84,14 +85,14 @@ class _Splats:
         self._sh_degree = SH_COEFFICIENTS.index(used)
         self._antialiased = prepared.antialiased
         self._background = torch.tensor(background, dtype=torch.float32, device=device)
-        rows = torch.from_numpy(prepared.gaussians).to(device).transpose(1, 2).reshape(-1, prepared_rows.ROWS)
+        rows = to_device(prepared.gaussians, device).transpose(1, 2).reshape(-1, prepared_rows.ROWS)
         # Those that fill up the last chunk have no opacity.
         seen = torch.isfinite(rows[:, prepared_rows.LOG_OPACITY])
         rows = rows[seen]
         self._means = rows[:, : prepared_rows.Z + 1].contiguous()
         self._covariances = rows[:, _COVARIANCE]
         self._opacities = torch.exp2(rows[:, prepared_rows.LOG_OPACITY])
-        sh = torch.from_numpy(prepared.sh[:, : 3 * used]).to(device).transpose(1, 2).reshape(-1, used, 3)
+        sh = to_device(prepared.sh[:, : 3 * used], device).transpose(1, 2).reshape(-1, used, 3)
         self._sh = sh[seen]  # in half precision
 
     @torch.no_grad()
@@ -109,9 +110,9 @@ class _Splats:
         K = camera.K.copy()
         # gsplat counts pixels from the image's corner, half a pixel before the centre of the first.
         K[:2, 2] += 0.5
-        # In one copy, for which the host does not wait.
+        # In one copy.
         numbers = np.concatenate([origin, center - origin, view.ravel(), K.ravel()]).astype(np.float32)
-        origin, rest, view, K = torch.from_numpy(numbers).to(device, non_blocking=True).split([3, 3, 16, 9])
+        origin, rest, view, K = to_device(numbers, device).split([3, 3, 16, 9])
         # Relative to the camera, so that a map far from its origin loses no digits in gsplat's float32.
         offsets = self._means - origin - rest
         _, cameras, seen, radii, means2d, depths, conics, compensations = gsplat.fully_fused_projection(
