@@ -19,8 +19,7 @@ from gsfeatloc_ros.arrays import Array, to_device
 from gsfeatloc_ros.match.base import Features, Matches
 from gsfeatloc_ros.match.nearest import match_mutual
 from gsfeatloc_ros.match.sift import CONTRAST_THRESHOLD, MAX_RATIO
-
-_LUMA = (0.299, 0.587, 0.114)
+from gsfeatloc_ros.match.tensor import LUMA
 
 # Scale space: the image, enlarged twofold, has the first blur; every octave begins at the second and doubles it in so
 # many layers. Three images more are needed for the differences below and above those.
@@ -162,7 +161,7 @@ class GpuSift:
         def constant(values: np.ndarray) -> torch.Tensor:
             return torch.tensor(values, dtype=torch.float32, device=device)
 
-        self._luma = constant(_LUMA)
+        self._luma = constant(LUMA)
         self._first_blur, self._blur = (constant(_blur_kernels(sigma)) for sigma in (_IMAGE_SIGMA, _SIGMA))
         self._derivatives = constant(_derivatives())
         offsets, weights = _window()

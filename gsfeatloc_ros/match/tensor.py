@@ -7,6 +7,9 @@ import torch
 from gsfeatloc_ros.arrays import Array, to_device
 from gsfeatloc_ros.match.base import Features, Matches
 
+# What red, green and blue count in brightness, as in OpenCV's.
+LUMA = (0.299, 0.587, 0.114)
+
 
 def is_blank(image: Array) -> bool:
     """Whether an RGB image (H, W, 3) has one colour: networks that normalize contrast find something even in that."""

@@ -13,6 +13,7 @@ from torch.nn.functional import avg_pool2d, conv2d, grid_sample, max_pool2d, pad
 
 from gsfeatloc_ros.arrays import Array, to_device
 from gsfeatloc_ros.match.base import Matches
+from gsfeatloc_ros.match.tensor import LUMA
 from gsfeatloc_ros.match.track import (
     CORNER_BLOCK,
     DISTANCE,
@@ -41,7 +42,6 @@ _DAMPING = 0.75
 _MOST = 128.0
 # OpenCV's 1e-4, which it compares with a 1024th of the mean of the squared gradients.
 _MIN_EIGENVALUE = 0.1024
-_LUMA = (0.299, 0.587, 0.114)
 # Smoothing across and derivative along an axis.
 _SOBEL = ((1, 2, 1), (-1, 0, 1))
 _SCHARR = ((3 / 16, 10 / 16, 3 / 16), (-1 / 2, 0, 1 / 2))
@@ -193,7 +193,7 @@ class _Constants:
 
     def __init__(self, height: int, width: int, device: str) -> None:
         self._device = device
-        self._luma = self._tensor(_LUMA)
+        self._luma = self._tensor(LUMA)
         self.sobel, self._scharr = (self._gradient_kernels(*kernels) for kernels in (_SOBEL, _SCHARR))
         self.last_pixel = self._tensor([width - 1, height - 1])
         # As matrices: two products of them are all that a separable filter takes, be it as wide as this one.
