@@ -26,9 +26,10 @@ import torch
 from cuda_on_cpu.gsplat_on_cpu import import_on_cpu
 from hypothesis import given
 from hypothesis import strategies as st
-from stand_in.gpu import as_kernel, simulated_gpu
+from stand_in.gpu import SimulatedGpu, as_kernel, simulated_gpu
 from test_render import assert_same, concatenated, one_gaussian, psnr, random_map, small_camera
 
+from gsfeatloc_ros.benchmark.frames import measure_frames
 from gsfeatloc_ros.geometry import make_pose, so3_exp
 from gsfeatloc_ros.maps import GaussianMap, Similarity
 from gsfeatloc_ros.maps.gaussian_map import SH_COEFFICIENTS
@@ -211,19 +212,37 @@ def test_threads_get_the_same_pictures(gsplat) -> None:
         np.testing.assert_array_equal(a.median_depth, b.median_depth)
 
 
-def test_a_render_is_made_and_stays_on_the_gpu(gsplat, monkeypatch) -> None:
+@pytest.fixture
+def gpu(gsplat, monkeypatch) -> SimulatedGpu:
+    """A simulated GPU, on which gsplat draws."""
     for name in FUNCTIONS:
         monkeypatch.setattr(gsplat, name, as_kernel(getattr(gsplat, name)))
-    gaussian_map = random_map(150, 1, seed=0)
     with simulated_gpu() as gpu:
-        renderer = GpuRenderer(gaussian_map, device=gpu.device)
-        gpu.reset()
-        render = renderer.render(small_camera(), POSE)
-        assert not gpu.to_host
-        # Where the camera is goes there, and nobody waits.
-        assert not gpu.waits
-        assert 0 < sum(gpu.to_device) < 200
-        assert_same(render.on_host(), CpuRenderer(gaussian_map).render(small_camera(), POSE), 70)
+        yield gpu
+
+
+def test_a_render_is_made_and_stays_on_the_gpu(gpu) -> None:
+    gaussian_map = random_map(150, 1, seed=0)
+    renderer = GpuRenderer(gaussian_map, device=gpu.device)
+    gpu.reset()
+    render = renderer.render(small_camera(), POSE)
+    assert not gpu.to_host
+    # Where the camera is goes there, and nobody waits.
+    assert not gpu.waits
+    assert 0 < sum(gpu.to_device) < 200
+    assert_same(render.on_host(), CpuRenderer(gaussian_map).render(small_camera(), POSE), 70)
+
+
+def test_frames_are_measured_by_stage_when_the_gpu_is_done(gpu, monkeypatch) -> None:
+    done = []
+    monkeypatch.setattr(torch.cuda, "synchronize", lambda: done.append(True))
+    renderer = GpuRenderer(random_map(150, 1, seed=0), device=gpu.device)
+    report = measure_frames(renderer, small_camera(), [POSE] * 3)
+    assert list(report["stages_wall_ms"]) == ["project", "colour", "tiles and sort", "blend"]
+    assert all(milliseconds > 0 for milliseconds in report["stages_wall_ms"].values())
+    assert report["coverage"] > 0.1
+    # Each frame, and each stage before and after.
+    assert len(done) >= 3 + 3 * 2 * 4
 
 
 @pytest.mark.parametrize("options", [{"sh_degree": 4}, {"resolution_scale": 0.0}])

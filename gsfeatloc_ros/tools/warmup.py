@@ -25,7 +25,7 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     start = time.perf_counter()
     try:
-        matcher = create_matcher(options.matcher, options.weights) if options.matcher else None
+        matcher = create_matcher(options.matcher, options.weights, device=options.device) if options.matcher else None
         loaded = time.perf_counter()
         done = warm_up(matcher, options.device)
     except (ValueError, RuntimeError, OSError) as error:
