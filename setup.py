@@ -40,7 +40,7 @@ setup(
         "plyfile>=1.0,<2",
         "poselib>=2.0.4,<3",
         "rosbags>=0.11,<0.12",
-        "torch>=2.2,<3",
+        "torch>=2.5.1,<3",
         "tqdm>=4.60,<5",
     ],
     extras_require={

@@ -7,7 +7,7 @@ cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
 # The +cpu build is named in full: no index can then put gigabytes of CUDA in its place.
 cpu_torch="torch==2.13.0+cpu"
-any_torch="torch>=2.2,<3"
+any_torch="torch>=2.5.1,<3"
 cpu_torch_index="https://download.pytorch.org/whl/cpu"
 
 fail() {
