@@ -91,6 +91,15 @@ def test_no_picture_leaves_the_gpu_before_the_pose_is_solved(
     assert max(gpu.to_host) > SMALL
 
 
+def test_a_matcher_on_the_cpu_takes_renders_of_a_gpu(gpu, renderer, room_camera, room_queries) -> None:
+    query = room_queries[0]
+    estimate = Localizer(renderer, create_matcher("sift", device="cpu")).localize(
+        query.image, room_camera, query.T_map_camera_prior
+    )
+    assert estimate.status is Status.LOCALIZED
+    assert translation_error(estimate.T_map_camera, query.T_map_camera) < 0.02
+
+
 def test_a_dark_photo_has_no_answer(gpu, renderer, room_camera, room_queries) -> None:
     query = room_queries[0]
     estimate = Localizer(renderer, MATCHERS["sift"]("", 2048, gpu.device)).localize(

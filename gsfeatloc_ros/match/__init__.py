@@ -7,7 +7,7 @@ from collections.abc import Callable
 from gsfeatloc_ros.match.base import Features, Matcher, Matches, Tracker
 from gsfeatloc_ros.match.weights import WeightsError
 from gsfeatloc_ros.photo import Photo
-from gsfeatloc_ros.render.availability import chosen_device
+from gsfeatloc_ros.render import chosen_device
 
 __all__ = [
     "DEFAULT_MATCHER",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from gsfeatloc_ros.arrays import Array, to_host
 from gsfeatloc_ros.match.base import Features, Matches
 from gsfeatloc_ros.match.nearest import match_mutual
 
@@ -22,9 +23,9 @@ class Sift:
             nfeatures=max_features, contrastThreshold=CONTRAST_THRESHOLD, enable_precise_upscale=True
         )
 
-    def features(self, image: np.ndarray) -> Features:
+    def features(self, image: Array) -> Features:
         """Extract the features of an RGB image (H, W, 3) uint8."""
-        keypoints, descriptors = self._sift.detectAndCompute(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), None)
+        keypoints, descriptors = self._sift.detectAndCompute(cv2.cvtColor(to_host(image), cv2.COLOR_RGB2GRAY), None)
         if not keypoints:
             return Features.none(128)
         descriptors = np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-9))
