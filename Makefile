@@ -21,7 +21,7 @@ test: lint build
 # Apart from .venv, where the renderer would find it and look for a GPU in every test.
 gsplat: build
 	@. scripts/env.sh && python -m pip install --quiet --upgrade --no-deps --target .venv/gsplat gsplat==1.5.3 jaxtyping wadler-lindig
-	@. scripts/env.sh && GSPLAT_ON_CPU=.venv/gsplat python -P -m pytest test/test_gpu.py
+	@. scripts/env.sh && GSPLAT_ON_CPU=.venv/gsplat python -P -m pytest test/gpu/test_gpu.py
 
 lint: setup
 	@. scripts/env.sh && ruff check . && ruff format --check .

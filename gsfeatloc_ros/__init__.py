@@ -2,7 +2,7 @@
 
 import os
 
-from gsfeatloc_ros.kernel_cache import set_kernel_cache
+from gsfeatloc_ros.common.kernel_cache import set_kernel_cache
 
 # Before torch and numba load OpenMP: its threads would spin while they wait for each other, which on busy cores makes
 # every call wait for the scheduler (measured: XFeat took 1500 ms instead of 50 beside one other busy process).

@@ -17,7 +17,7 @@ if can_compile; then
     paths+=(interfaces)
     # ROS's wheels have no tf2_msgs; the tests need its one message.
     if ! ros_is_sourced python; then
-        paths+=(test/tf2_msgs)
+        paths+=(test/support/tf2_msgs)
     fi
 else
     echo "build: the service ~/localize_image is off, it needs cmake, a C++ compiler and Python's headers (Debian, Ubuntu: apt install cmake g++ python3-dev)" >&2

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gsfeatloc_ros.camera import Camera
+from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.maps.gaussian_map import GaussianMap
 from gsfeatloc_ros.maps.ply import write_ply
 from gsfeatloc_ros.simulate import Query, Room, cover, simulate_queries

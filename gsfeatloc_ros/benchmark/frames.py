@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 
 from gsfeatloc_ros.benchmark.measure import finish, memory_taken, spread, stage_time, timed
-from gsfeatloc_ros.camera import Camera
+from gsfeatloc_ros.common.camera import Camera
+from gsfeatloc_ros.common.geometry import make_pose
+from gsfeatloc_ros.common.stage_clock import StageClock
 from gsfeatloc_ros.evaluate.scene import load_scene
-from gsfeatloc_ros.geometry import make_pose
+from gsfeatloc_ros.localize.first_run import warm_up
 from gsfeatloc_ros.maps import GaussianMap, load_map
 from gsfeatloc_ros.render import Render, Renderer, create_renderer
 from gsfeatloc_ros.render.cache import load_prepared
-from gsfeatloc_ros.timing import StageClock
-from gsfeatloc_ros.warmup import warm_up
 
 Size = tuple[int, int]
 

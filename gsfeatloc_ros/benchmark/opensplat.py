@@ -12,8 +12,8 @@ from torch.utils.cpp_extension import load_inline
 
 from gsfeatloc_ros.benchmark.frames import UNCOUNTED
 from gsfeatloc_ros.benchmark.measure import spread, timed
-from gsfeatloc_ros.camera import Camera
-from gsfeatloc_ros.geometry import invert
+from gsfeatloc_ros.common.camera import Camera
+from gsfeatloc_ros.common.geometry import invert
 from gsfeatloc_ros.maps import GaussianMap
 from gsfeatloc_ros.render import create_renderer
 

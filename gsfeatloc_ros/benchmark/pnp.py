@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 
 from gsfeatloc_ros.benchmark.measure import timed
-from gsfeatloc_ros.camera import Camera
-from gsfeatloc_ros.geometry import (
+from gsfeatloc_ros.common.camera import Camera
+from gsfeatloc_ros.common.geometry import (
     invert,
     make_pose,
     random_unit_vector,

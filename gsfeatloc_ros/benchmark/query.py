@@ -10,15 +10,15 @@ from typing import Any
 
 import numpy as np
 
-from gsfeatloc_ros import localize
 from gsfeatloc_ros.benchmark.measure import spread, stage_time, timed
+from gsfeatloc_ros.common.stage_clock import StageClock
 from gsfeatloc_ros.evaluate.protocol import make_priors, paper_prior_error
 from gsfeatloc_ros.evaluate.scene import load_scene
-from gsfeatloc_ros.localize import Localizer
+from gsfeatloc_ros.localize import localizer as localize
+from gsfeatloc_ros.localize.localizer import Localizer
 from gsfeatloc_ros.maps import load_map
 from gsfeatloc_ros.match import create_matcher
 from gsfeatloc_ros.render import create_renderer
-from gsfeatloc_ros.timing import StageClock
 
 
 def measure_queries(scene_path: Path, matcher_name: str, sigma: float, device: str, threads: int) -> dict[str, Any]:

@@ -14,11 +14,11 @@ from types import ModuleType
 
 import numpy as np
 
-from gsfeatloc_ros import localize
-from gsfeatloc_ros.arrays import Array
-from gsfeatloc_ros.camera import Camera
+from gsfeatloc_ros.common.arrays import Array
+from gsfeatloc_ros.common.camera import Camera
+from gsfeatloc_ros.common.photo import Photo
+from gsfeatloc_ros.localize import localizer as localize
 from gsfeatloc_ros.match import Matcher, Matches, create_tracker
-from gsfeatloc_ros.photo import Photo
 from gsfeatloc_ros.pose import lift, solve
 from gsfeatloc_ros.render.base import Render, Renderer
 

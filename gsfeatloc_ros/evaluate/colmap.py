@@ -11,10 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from gsfeatloc_ros.camera import Camera
+from gsfeatloc_ros.common.camera import Camera
+from gsfeatloc_ros.common.geometry import invert, make_pose
 from gsfeatloc_ros.evaluate.dataset import Photo
 from gsfeatloc_ros.evaluate.extras import import_extra
-from gsfeatloc_ros.geometry import invert, make_pose
 
 _TEST_EVERY = 8
 # Of each of COLMAP's models: which parameters are fx, fy, cx and cy, ours behind it, and which its coefficients are

@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from gsfeatloc_ros.camera import Camera
+from gsfeatloc_ros.common.camera import Camera
 
 
 @dataclass(frozen=True, eq=False)

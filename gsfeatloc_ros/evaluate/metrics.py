@@ -8,8 +8,8 @@ from dataclasses import asdict, dataclass, fields
 
 import numpy as np
 
-from gsfeatloc_ros.estimate import Estimate
-from gsfeatloc_ros.geometry import rotation_error_deg, so3_log, translation_error
+from gsfeatloc_ros.common.geometry import rotation_error_deg, so3_log, translation_error
+from gsfeatloc_ros.localize.estimate import Estimate
 
 MAX_ROTATION_ERROR_DEG = 5.0
 MAX_TRANSLATION_ERROR = 0.05  # over the radius of the trajectory

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gsfeatloc_ros.camera import Camera
+from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.evaluate.dataset import Photo, read_image
 from gsfeatloc_ros.evaluate.nerfstudio import frame_pose, naming, read_transforms
 

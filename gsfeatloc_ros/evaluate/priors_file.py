@@ -14,9 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
+from gsfeatloc_ros.common.geometry import make_pose, matrix_from_quaternion
 from gsfeatloc_ros.evaluate.dataset import Scene
 from gsfeatloc_ros.evaluate.protocol import Prior
-from gsfeatloc_ros.geometry import make_pose, matrix_from_quaternion
 
 _NUMBERS = ("tx", "ty", "tz", "qx", "qy", "qz", "qw")
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gsfeatloc_ros.common.geometry import make_pose, random_unit_vector, so3_exp
 from gsfeatloc_ros.evaluate.dataset import Scene
-from gsfeatloc_ros.geometry import make_pose, random_unit_vector, so3_exp
 
 # Square root of the 95 % quantile of the chi-square distribution with 3 degrees of freedom: the published bounds below
 # are taken as the radius of the ball that holds 95 % of an isotropic 3D normal distribution.

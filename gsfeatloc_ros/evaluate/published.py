@@ -5,10 +5,10 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from gsfeatloc_ros.arrays import to_host
-from gsfeatloc_ros.camera import Camera
-from gsfeatloc_ros.estimate import Estimate, Status
-from gsfeatloc_ros.geometry import invert, make_pose, transform
+from gsfeatloc_ros.common.arrays import to_host
+from gsfeatloc_ros.common.camera import Camera
+from gsfeatloc_ros.common.geometry import invert, make_pose, transform
+from gsfeatloc_ros.localize.estimate import Estimate, Status
 from gsfeatloc_ros.match.base import Matcher
 from gsfeatloc_ros.render.base import Renderer
 

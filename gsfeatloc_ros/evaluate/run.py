@@ -10,8 +10,8 @@ from pathlib import Path
 
 import cv2
 
-from gsfeatloc_ros.estimate import Estimate
 from gsfeatloc_ros.evaluate.ablation import MeanDepthRenderer, without
+from gsfeatloc_ros.evaluate.corruptions import SPOILERS
 from gsfeatloc_ros.evaluate.dataset import Scene
 from gsfeatloc_ros.evaluate.extras import import_extra
 from gsfeatloc_ros.evaluate.metrics import QueryResult, measure
@@ -19,8 +19,8 @@ from gsfeatloc_ros.evaluate.priors_file import read_priors
 from gsfeatloc_ros.evaluate.protocol import PROTOCOLS, Prior, trajectory_radius
 from gsfeatloc_ros.evaluate.published import PublishedLocalizer
 from gsfeatloc_ros.evaluate.scene import load_scene
-from gsfeatloc_ros.evaluate.spoil import SPOILERS
-from gsfeatloc_ros.localize import Localizer, LocalizerOptions
+from gsfeatloc_ros.localize.estimate import Estimate
+from gsfeatloc_ros.localize.localizer import Localizer, LocalizerOptions
 from gsfeatloc_ros.maps import load_map
 from gsfeatloc_ros.match import Matcher, create_matcher
 from gsfeatloc_ros.render import Renderer, create_renderer

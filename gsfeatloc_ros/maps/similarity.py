@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from gsfeatloc_ros.geometry import make_pose
+from gsfeatloc_ros.common.geometry import make_pose
 
 # How far the rows of a rotation matrix may be from orthonormal: nerfstudio writes float32.
 _ORTHONORMAL_TOLERANCE = 1e-4

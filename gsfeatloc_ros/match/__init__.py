@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from gsfeatloc_ros.common.photo import Photo
 from gsfeatloc_ros.match.base import Features, Matcher, Matches, Tracker
 from gsfeatloc_ros.match.weights import WeightsError
-from gsfeatloc_ros.photo import Photo
 from gsfeatloc_ros.render import chosen_device
 
 __all__ = [

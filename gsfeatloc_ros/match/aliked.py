@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from kornia.feature import ALIKED
 
-from gsfeatloc_ros.arrays import Array
+from gsfeatloc_ros.common.arrays import Array
 from gsfeatloc_ros.match.base import Features
 from gsfeatloc_ros.match.peaks import find_peaks, fit_quadratic
 from gsfeatloc_ros.match.tensor import to_tensor

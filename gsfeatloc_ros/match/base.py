@@ -8,7 +8,7 @@ from typing import Protocol, TypeVar
 
 import numpy as np
 
-from gsfeatloc_ros.arrays import Array
+from gsfeatloc_ros.common.arrays import Array
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,7 @@ from pathlib import Path
 import torch
 from kornia.feature import LightGlue
 
-from gsfeatloc_ros.arrays import Array
+from gsfeatloc_ros.common.arrays import Array
 from gsfeatloc_ros.match.base import Extractor, Features, Matches
 from gsfeatloc_ros.match.tensor import to_matches
 from gsfeatloc_ros.match.weights import Weights, WeightsError, fill

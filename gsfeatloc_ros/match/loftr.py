@@ -8,7 +8,7 @@ import torch
 from kornia.color import rgb_to_grayscale
 from kornia.feature import LoFTR
 
-from gsfeatloc_ros.arrays import Array
+from gsfeatloc_ros.common.arrays import Array
 from gsfeatloc_ros.match.base import Matches
 from gsfeatloc_ros.match.tensor import is_blank, to_tensor
 from gsfeatloc_ros.match.weights import Weights, fill

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from gsfeatloc_ros.arrays import Array, to_host
+from gsfeatloc_ros.common.arrays import Array, to_host
 from gsfeatloc_ros.match.base import Features, Matches
 from gsfeatloc_ros.match.nearest import match_mutual
 

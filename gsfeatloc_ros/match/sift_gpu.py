@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch.nn import functional
 
-from gsfeatloc_ros.arrays import Array, to_device
+from gsfeatloc_ros.common.arrays import Array, to_device
 from gsfeatloc_ros.match.base import Features, Matches
 from gsfeatloc_ros.match.nearest import match_mutual
 from gsfeatloc_ros.match.sift import CONTRAST_THRESHOLD, MAX_RATIO

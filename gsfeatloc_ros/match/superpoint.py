@@ -13,7 +13,7 @@ from pathlib import Path
 import torch
 from kornia.color import rgb_to_grayscale
 
-from gsfeatloc_ros.arrays import Array
+from gsfeatloc_ros.common.arrays import Array
 from gsfeatloc_ros.match.base import Matches
 from gsfeatloc_ros.match.lightglue import PlacedFeatures
 from gsfeatloc_ros.match.peaks import cell_heatmap, centroid

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from gsfeatloc_ros.arrays import Array, to_device
+from gsfeatloc_ros.common.arrays import Array, to_device
 from gsfeatloc_ros.match.base import Features, Matches
 
 # What red, green and blue count in brightness, as in OpenCV's.

@@ -5,9 +5,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from gsfeatloc_ros.common.local_structure import local_structure
+from gsfeatloc_ros.common.photo import Photo
 from gsfeatloc_ros.match.base import Matches
-from gsfeatloc_ros.photo import Photo
-from gsfeatloc_ros.structure import local_structure
 
 # Corners (Shi and Tomasi, 1994): at most this many, at least so many pixels apart, and of at least this share of the
 # strongest one's strength.

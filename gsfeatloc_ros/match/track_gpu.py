@@ -11,7 +11,8 @@ import numpy as np
 import torch
 from torch.nn.functional import avg_pool2d, conv2d, grid_sample, max_pool2d, pad
 
-from gsfeatloc_ros.arrays import Array, to_device
+from gsfeatloc_ros.common.arrays import Array, to_device
+from gsfeatloc_ros.common.photo import Photo
 from gsfeatloc_ros.match.base import Matches
 from gsfeatloc_ros.match.tensor import LUMA
 from gsfeatloc_ros.match.track import (
@@ -27,7 +28,6 @@ from gsfeatloc_ros.match.track import (
     WINDOW,
     seen_off_the_border,
 )
-from gsfeatloc_ros.photo import Photo
 
 # Peaks that are looked at for corners. There is about one in 25 pixels, a corner needs 50 to 80 for itself.
 _CANDIDATES = 4 * MAX_CORNERS

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from kornia.feature import XFeat
 
-from gsfeatloc_ros.arrays import Array
+from gsfeatloc_ros.common.arrays import Array
 from gsfeatloc_ros.match.base import Features, Matches
 from gsfeatloc_ros.match.nearest import match_mutual
 from gsfeatloc_ros.match.peaks import cell_heatmap, centroid

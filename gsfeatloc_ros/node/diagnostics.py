@@ -11,7 +11,7 @@ from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 
-from gsfeatloc_ros.estimate import Estimate
+from gsfeatloc_ros.localize.estimate import Estimate
 from gsfeatloc_ros.node.qos import RELIABLE
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR

@@ -16,8 +16,8 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
+from gsfeatloc_ros.localize.engine import Engine, load_engine
 from gsfeatloc_ros.node.diagnostics import ERROR, OK, Reporter
-from gsfeatloc_ros.node.engine import Engine, load_engine
 from gsfeatloc_ros.node.parameters import check_choices, declare_parameters
 from gsfeatloc_ros.node.session import LocalizeImage, Session
 from gsfeatloc_ros.node.transforms import Transforms

@@ -8,12 +8,12 @@ import numpy as np
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.node import Node
 
-from gsfeatloc_ros.geometry import matrix_from_quaternion
-from gsfeatloc_ros.inputs import PriorPolicy
-from gsfeatloc_ros.localize import LocalizerOptions
+from gsfeatloc_ros.common.geometry import matrix_from_quaternion
+from gsfeatloc_ros.localize.localizer import LocalizerOptions
 from gsfeatloc_ros.maps import Similarity, read_dataparser_transforms
 from gsfeatloc_ros.match import DEFAULT_MATCHER, DEFAULT_MAX_FEATURES, MATCHERS
 from gsfeatloc_ros.render import DEVICES
+from gsfeatloc_ros.ros_io.inputs import PriorPolicy
 
 BODIES = ("camera", "base")
 

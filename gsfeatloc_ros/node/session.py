@@ -19,18 +19,18 @@ from rclpy.subscription import Subscription
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_srvs.srv import Trigger
 
-from gsfeatloc_ros.camera import Camera
-from gsfeatloc_ros.estimate import Estimate
-from gsfeatloc_ros.inputs import Inputs, RoughPose
-from gsfeatloc_ros.messages import decode_camera, nanoseconds, validate_image
-from gsfeatloc_ros.node.answers import Answers
+from gsfeatloc_ros.common.camera import Camera
+from gsfeatloc_ros.common.stage_clock import Interrupted
+from gsfeatloc_ros.localize.engine import Engine
+from gsfeatloc_ros.localize.estimate import Estimate
 from gsfeatloc_ros.node.diagnostics import ERROR, OK, WARN, Health, Reporter, evidence, stamp_text
-from gsfeatloc_ros.node.engine import Engine
 from gsfeatloc_ros.node.parameters import Value, localizer_options, prior_policy
+from gsfeatloc_ros.node.publishers import Answers
 from gsfeatloc_ros.node.qos import NEWEST, ODOMETRY, RELIABLE, subscribe
 from gsfeatloc_ros.node.transforms import Transforms
 from gsfeatloc_ros.node.worker import Worker
-from gsfeatloc_ros.timing import Interrupted
+from gsfeatloc_ros.ros_io.decode import decode_camera, nanoseconds, validate_image
+from gsfeatloc_ros.ros_io.inputs import Inputs, RoughPose
 
 try:
     from gsfeatloc_interfaces.srv import LocalizeImage

@@ -11,7 +11,7 @@ from geometry_msgs.msg import TransformStamped
 from rclpy.node import Node
 from rclpy.time import Time as RclpyTime
 
-from gsfeatloc_ros.geometry import make_pose, matrix_from_quaternion, quaternion_from_matrix
+from gsfeatloc_ros.common.geometry import make_pose, matrix_from_quaternion, quaternion_from_matrix
 
 # Seconds between two looks at what has come meanwhile.
 _POLL_PERIOD = 0.01

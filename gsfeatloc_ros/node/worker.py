@@ -8,7 +8,7 @@ from concurrent.futures import Future
 from threading import Condition, Event, Thread
 from typing import Generic, TypeVar
 
-from gsfeatloc_ros.timing import Interrupted
+from gsfeatloc_ros.common.stage_clock import Interrupted
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsfeatloc_ros.arrays import to_device
-from gsfeatloc_ros.camera import Camera
-from gsfeatloc_ros.geometry import transform
+from gsfeatloc_ros.common.arrays import to_device
+from gsfeatloc_ros.common.camera import Camera
+from gsfeatloc_ros.common.geometry import transform
 from gsfeatloc_ros.render.base import Render
 
 # A pixel is lifted where its four neighbours are covered by splats and lie on one surface: the largest step of depth

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 import poselib
 
-from gsfeatloc_ros.camera import Camera
-from gsfeatloc_ros.geometry import invert, make_pose, skew, so3_exp
+from gsfeatloc_ros.common.camera import Camera
+from gsfeatloc_ros.common.geometry import invert, make_pose, skew, so3_exp
 
 _MIN_ITERATIONS, _MAX_ITERATIONS = 200, 10_000
 # A P3P sample and one match to choose among its solutions; under-determined sets have no covariance.

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from gsfeatloc_ros.common.device import DEVICES, chosen_device
 from gsfeatloc_ros.maps.gaussian_map import GaussianMap
-from gsfeatloc_ros.render.availability import DEVICES, chosen_device
 from gsfeatloc_ros.render.base import Render, Renderer
 
 if TYPE_CHECKING:

@@ -8,8 +8,8 @@ from typing import Protocol
 
 import numpy as np
 
-from gsfeatloc_ros.arrays import Array, to_host
-from gsfeatloc_ros.camera import Camera
+from gsfeatloc_ros.common.arrays import Array, to_host
+from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.maps.gaussian_map import GaussianMap
 
 # Conventions of gsplat and of the INRIA rasterizer: a Gaussian is blurred by 0.3 square pixels, contributes where its

@@ -16,7 +16,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from gsfeatloc_ros.kernel_cache import hash_of_sources
+from gsfeatloc_ros.common.kernel_cache import hash_of_sources
 from gsfeatloc_ros.maps import MapError, Similarity, load_map
 from gsfeatloc_ros.render.prepare import PreparedMap, prepare
 

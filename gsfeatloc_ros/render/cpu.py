@@ -7,14 +7,14 @@ import os
 import numba
 import numpy as np
 
-from gsfeatloc_ros.camera import Camera
+from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.maps.gaussian_map import SH_COEFFICIENTS, GaussianMap
 from gsfeatloc_ros.render.base import Render, SplatRenderer, check_range
 from gsfeatloc_ros.render.blend import blend, gather, tile_starts
+from gsfeatloc_ros.render.camera_view import view_of, visible_chunks
 from gsfeatloc_ros.render.enlarge import draw_scaled
 from gsfeatloc_ros.render.prepare import CHUNK, KERNEL_LOCK, PreparedMap, prepare
 from gsfeatloc_ros.render.project import SPLAT_SIZE, TILE, project
-from gsfeatloc_ros.render.view import view_of, visible_chunks
 
 _MAX_THREADS = 1024
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 
-from gsfeatloc_ros.camera import Camera
+from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.render.base import Render
 
 

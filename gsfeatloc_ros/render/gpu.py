@@ -8,15 +8,15 @@ import threading
 import numpy as np
 import torch
 
-from gsfeatloc_ros.arrays import to_device
-from gsfeatloc_ros.camera import Camera
+from gsfeatloc_ros.common.arrays import to_device
+from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.maps.gaussian_map import SH_COEFFICIENTS, GaussianMap
 from gsfeatloc_ros.render import prepare as prepared_rows
 from gsfeatloc_ros.render.base import DEPTH_MIN_ALPHA, EPS2D, NEAR_PLANE, Render, SplatRenderer, check_range
 from gsfeatloc_ros.render.cpu import CpuRenderer
+from gsfeatloc_ros.render.depth_bins import Slabs
 from gsfeatloc_ros.render.enlarge import draw_scaled
 from gsfeatloc_ros.render.prepare import PreparedMap, prepare
-from gsfeatloc_ros.render.slabs import Slabs
 
 # What the pictures of the self-check must agree in with the CPU's. Rounding leaves more than 60 dB; half a pixel or a
 # mirrored axis, less than 40.

@@ -11,7 +11,7 @@ import numpy as np
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from gsfeatloc_ros.geometry import quaternion_from_matrix, rotation_error_deg, translation_error
+from gsfeatloc_ros.common.geometry import quaternion_from_matrix, rotation_error_deg, translation_error
 from gsfeatloc_ros.replay.run import Answer
 from gsfeatloc_ros.replay.truth import Trajectory
 

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from gsfeatloc_ros.estimate import Estimate
-from gsfeatloc_ros.inputs import Inputs, PriorPolicy
-from gsfeatloc_ros.localize import Localizer
-from gsfeatloc_ros.messages import decode_pose, nanoseconds
+from gsfeatloc_ros.localize.estimate import Estimate
+from gsfeatloc_ros.localize.localizer import Localizer
 from gsfeatloc_ros.replay.bag import Bag, Recorded
+from gsfeatloc_ros.ros_io.decode import decode_pose, nanoseconds
+from gsfeatloc_ros.ros_io.inputs import Inputs, PriorPolicy
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from gsfeatloc_ros.geometry import interpolate
+from gsfeatloc_ros.common.geometry import interpolate
 
 # Between poses farther apart than this many seconds the truth is not known.
 MAX_GAP = 0.25

@@ -1,7 +1,7 @@
 """A simulated room: its photos, its Gaussian Splatting map and its bag, for the demo and the tests."""
 
 from gsfeatloc_ros.simulate.bag import write_bag
-from gsfeatloc_ros.simulate.queries import Query, simulate_queries
+from gsfeatloc_ros.simulate.photos import Query, simulate_queries
 from gsfeatloc_ros.simulate.room import Room, Trace
 from gsfeatloc_ros.simulate.splat import cover
 

@@ -9,9 +9,9 @@ import numpy as np
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from gsfeatloc_ros.camera import Camera
-from gsfeatloc_ros.geometry import quaternion_from_matrix
-from gsfeatloc_ros.simulate.queries import Query
+from gsfeatloc_ros.common.camera import Camera
+from gsfeatloc_ros.common.geometry import quaternion_from_matrix
+from gsfeatloc_ros.simulate.photos import Query
 
 IMAGE_TOPIC = "/camera/image_raw"
 CAMERA_INFO_TOPIC = "/camera/camera_info"

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from gsfeatloc_ros.camera import Camera
+from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.simulate.solids import Box, Solid, Sphere, rotate
 from gsfeatloc_ros.simulate.texture import paint
 

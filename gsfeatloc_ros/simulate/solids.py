@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from gsfeatloc_ros.geometry import so3_exp
+from gsfeatloc_ros.common.geometry import so3_exp
 
 # The axes along which u and v of a face run, by the axis of its normal.
 _FACE_AXES = np.array([[1, 2], [0, 2], [0, 1]])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsfeatloc_ros.geometry import make_pose
+from gsfeatloc_ros.common.geometry import make_pose
 from gsfeatloc_ros.maps.assemble import SH_C0
 from gsfeatloc_ros.maps.gaussian_map import SH_COEFFICIENTS, GaussianMap
 

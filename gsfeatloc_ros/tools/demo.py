@@ -24,12 +24,12 @@ import cv2
 import numpy as np
 from ament_index_python.packages import get_package_prefix, get_package_share_directory
 
-from gsfeatloc_ros.camera import Camera
-from gsfeatloc_ros.geometry import rotation_error_deg, translation_error
+from gsfeatloc_ros.client.bag_player import Answer, Topics, play_bag
+from gsfeatloc_ros.common.camera import Camera
+from gsfeatloc_ros.common.geometry import rotation_error_deg, translation_error
 from gsfeatloc_ros.maps.gaussian_map import GaussianMap
 from gsfeatloc_ros.maps.ply import write_ply
 from gsfeatloc_ros.match import DEFAULT_MATCHER, MATCHERS
-from gsfeatloc_ros.node.bag_player import Answer, Topics, play_bag
 from gsfeatloc_ros.render import Renderer, create_renderer
 from gsfeatloc_ros.simulate import Query, Room, cover, simulate_queries, write_bag
 from gsfeatloc_ros.simulate.bag import CAMERA_INFO_TOPIC, IMAGE_TOPIC, PRIOR_TOPIC

@@ -23,12 +23,12 @@ from pathlib import Path
 from tqdm import tqdm
 
 from gsfeatloc_ros.evaluate.ablation import PIECES
+from gsfeatloc_ros.evaluate.corruptions import SPOILERS
 from gsfeatloc_ros.evaluate.metrics import MAX_ROTATION_ERROR_DEG, MAX_TRANSLATION_ERROR, QueryResult
 from gsfeatloc_ros.evaluate.protocol import PROTOCOLS
 from gsfeatloc_ros.evaluate.record import Fingerprint, Record, fingerprint_of, hash_scene
 from gsfeatloc_ros.evaluate.run import METHODS, PRIORS_FILE, Run, Task, draw_priors, localize_all
 from gsfeatloc_ros.evaluate.scene import load_scene
-from gsfeatloc_ros.evaluate.spoil import SPOILERS
 from gsfeatloc_ros.evaluate.tables import RunResults, describe, over_seeds, query_table, run_table
 from gsfeatloc_ros.match import DEFAULT_MATCHER, MATCHERS
 from gsfeatloc_ros.tools.options import Settings, localizer_options, number, setting

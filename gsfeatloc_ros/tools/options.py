@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable
 from dataclasses import fields
 
-from gsfeatloc_ros.localize import LocalizerOptions
+from gsfeatloc_ros.localize.localizer import LocalizerOptions
 
 
 class Settings(argparse.Action):

@@ -23,10 +23,9 @@ from statistics import median
 
 from tqdm import tqdm
 
+from gsfeatloc_ros.common.geometry import matrix_from_quaternion
 from gsfeatloc_ros.evaluate.extras import import_extra
-from gsfeatloc_ros.geometry import matrix_from_quaternion
-from gsfeatloc_ros.inputs import PriorPolicy
-from gsfeatloc_ros.localize import Localizer, LocalizerOptions
+from gsfeatloc_ros.localize.localizer import Localizer, LocalizerOptions
 from gsfeatloc_ros.maps import Similarity, read_dataparser_transforms
 from gsfeatloc_ros.match import DEFAULT_MATCHER, MATCHERS, create_matcher
 from gsfeatloc_ros.render import create_renderer
@@ -36,6 +35,7 @@ from gsfeatloc_ros.replay.figure import write_figure
 from gsfeatloc_ros.replay.output import errors, write_bag, write_csv, write_tum
 from gsfeatloc_ros.replay.run import Answer, Replay
 from gsfeatloc_ros.replay.truth import Trajectory
+from gsfeatloc_ros.ros_io.inputs import PriorPolicy
 from gsfeatloc_ros.tools.options import Settings, localizer_options, number, setting
 
 # Reasons in the summary, of which there may be as many as images.

@@ -10,10 +10,10 @@ import argparse
 import sys
 import time
 
-from gsfeatloc_ros.kernel_cache import kernel_cache_folder
+from gsfeatloc_ros.common.kernel_cache import kernel_cache_folder
+from gsfeatloc_ros.localize.first_run import warm_up
 from gsfeatloc_ros.match import MATCHERS, create_matcher
 from gsfeatloc_ros.render import DEVICES
-from gsfeatloc_ros.warmup import warm_up
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -9,13 +9,13 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from gsfeatloc_ros.camera import Camera
-from gsfeatloc_ros.estimate import Estimate
+from gsfeatloc_ros.common.camera import Camera
+from gsfeatloc_ros.common.geometry import invert, transform
 from gsfeatloc_ros.evaluate.metrics import QueryResult
 from gsfeatloc_ros.evaluate.pictures import mark_matches, side_by_side
 from gsfeatloc_ros.evaluate.run import Task, localize, open_renderer, open_scene
 from gsfeatloc_ros.evaluate.tables import RunResults
-from gsfeatloc_ros.geometry import invert, transform
+from gsfeatloc_ros.localize.estimate import Estimate
 from gsfeatloc_ros.match.base import Matches
 from gsfeatloc_ros.render import Render, Renderer
 

@@ -1,0 +1,42 @@
+"""The photo as it is worked with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from gsfeatloc_ros.common.camera import Camera
+
+
+@dataclass(frozen=True, eq=False)
+class Photo:
+    """A photo as a pinhole camera would have taken it, so that it compares with renders pixel by pixel.
+
+    Attributes:
+        image: (H, W, 3) uint8 RGB.
+        seen: (H, W) bool, where the lens saw something.
+        camera: without distortion.
+    """
+
+    image: np.ndarray
+    seen: np.ndarray
+    camera: Camera
+
+    @staticmethod
+    def undistorted(image: np.ndarray, camera: Camera, max_width: int) -> Photo:
+        """The photo `image` (H, W, 3) uint8 RGB that `camera` observed, at most `max_width` pixels wide."""
+        image, camera = camera.limit(image, max_width)
+        seen = camera.undistort_image(np.full(image.shape[:2], 255, np.uint8)) == 255
+        return Photo(camera.undistort_image(image), seen, camera.pinhole())
+
+    def limited(self, max_width: int) -> Photo:
+        """The same at most `max_width` pixels wide."""
+        image, camera = self.camera.limit(self.image, max_width)
+        seen = cv2.resize(self.seen.astype(np.uint8), (camera.width, camera.height), interpolation=cv2.INTER_NEAREST)
+        return Photo(image, seen.astype(bool), camera)
+
+    def gray(self) -> np.ndarray:
+        """Brightness (H, W) uint8."""
+        return cv2.cvtColor(self.image, cv2.COLOR_RGB2GRAY)

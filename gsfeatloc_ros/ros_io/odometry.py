@@ -1,0 +1,67 @@
+"""How the robot has moved of late, as its odometry says."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from threading import Lock
+
+import numpy as np
+
+from gsfeatloc_ros.common.geometry import interpolate, invert
+
+# Where the odometry was silent for longer than this, in nanoseconds, it does not say where the robot was.
+_GAP = 200_000_000
+# Stamps that go back farther than this are those of another run (a looped bag, a simulation started anew).
+_RESTART = 1_000_000_000
+
+
+class Odometry:
+    """The newest poses of a body in its odometry frame; may be filled and read by different threads.
+
+    Args:
+        seconds: how far back they are kept.
+    """
+
+    def __init__(self, seconds: float) -> None:
+        self._kept = int(1e9 * seconds)
+        self._lock = Lock()
+        self._stamps: list[int] = []
+        self._poses: list[np.ndarray] = []
+
+    def add(self, stamp: int, pose: np.ndarray) -> None:
+        """Take the pose T_odom_body (4, 4) at `stamp` (nanoseconds); one that comes out of order is left out."""
+        with self._lock:
+            if self._stamps and stamp < self._stamps[-1] - _RESTART:
+                self._stamps, self._poses = [], []
+            if self._stamps and stamp <= self._stamps[-1]:
+                return
+            self._stamps.append(stamp)
+            self._poses.append(pose)
+            # Seldom, for it moves all that stays.
+            if self._stamps[0] < stamp - 2 * self._kept:
+                first = bisect_left(self._stamps, stamp - self._kept)
+                del self._stamps[:first], self._poses[:first]
+
+    def forget_after(self, stamp: int) -> None:
+        """Leave out what is stamped later than `stamp` (nanoseconds)."""
+        with self._lock:
+            end = bisect_left(self._stamps, stamp)
+            del self._stamps[end:], self._poses[end:]
+
+    def motion(self, start: int, end: int) -> np.ndarray | None:
+        """Pose (4, 4) of the body at `end` in the body's frame at `start` (nanoseconds).
+
+        None where it is not known, because nothing came near one of the two times.
+        """
+        with self._lock:
+            at_start, at_end = self._at(start), self._at(end)
+        return None if at_start is None or at_end is None else invert(at_start) @ at_end
+
+    def _at(self, stamp: int) -> np.ndarray | None:
+        after = bisect_left(self._stamps, stamp)
+        if 0 < after < len(self._stamps):
+            low, high = self._stamps[after - 1], self._stamps[after]
+            if high - low <= 2 * _GAP:
+                return interpolate(self._poses[after - 1], self._poses[after], (stamp - low) / (high - low))
+        near = [i for i in (after - 1, after) if 0 <= i < len(self._stamps) and abs(self._stamps[i] - stamp) <= _GAP]
+        return self._poses[min(near, key=lambda i: abs(self._stamps[i] - stamp))] if near else None

@@ -1,0 +1,118 @@
+"""A whole query on a GPU: the same answers as on the CPU, and no picture leaves the device before the pose is solved.
+
+The GPU is a simulated one (stand_in/gpu.py).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from kornia.feature import LightGlue
+from stand_in.gpu import NAME, SimulatedGpu, simulated_gpu
+
+from gsfeatloc_ros.common.geometry import rotation_error_deg, translation_error
+from gsfeatloc_ros.localize.estimate import Status
+from gsfeatloc_ros.localize.localizer import Localizer
+from gsfeatloc_ros.match import MATCHERS, create_matcher
+from gsfeatloc_ros.render import Render
+from gsfeatloc_ros.render.cpu import CpuRenderer
+
+# Bytes of matches, corners and what is at their pixels. The smallest picture, 320x240 in grey, has 76 800.
+SMALL = 50_000
+
+
+class OnGpu:
+    """A renderer whose pictures lie on the simulated GPU."""
+
+    device = NAME
+
+    def __init__(self, gaussian_map) -> None:
+        self._renderer = CpuRenderer(gaussian_map)
+
+    def render(self, camera, T_map_camera) -> Render:
+        pictures = vars(self._renderer.render(camera, T_map_camera)).values()
+        return Render(*(torch.from_numpy(picture).to(self.device) for picture in pictures))
+
+
+@pytest.fixture
+def gpu(monkeypatch) -> SimulatedGpu:
+    # kornia knows from how many keypoints on it is worth dropping some, for the devices that it knows.
+    monkeypatch.setitem(LightGlue.pruning_keypoint_thresholds, NAME, -1)
+    with simulated_gpu() as gpu:
+        yield gpu
+
+
+@pytest.fixture(scope="module")
+def renderer(room_map) -> OnGpu:
+    return OnGpu(room_map)
+
+
+@pytest.mark.parametrize("name", ["sift", "xfeat", "xfeat-lighterglue"])
+def test_finds_the_camera_as_on_the_cpu(gpu, renderer, room_map, room_camera, room_queries, name) -> None:
+    on_gpu = Localizer(renderer, MATCHERS[name]("", 2048, gpu.device))
+    on_cpu = Localizer(CpuRenderer(room_map), create_matcher(name, device="cpu"))
+    for query in room_queries[:3]:
+        there, here = (
+            localizer.localize(query.image, room_camera, query.T_map_camera_prior) for localizer in (on_gpu, on_cpu)
+        )
+        assert there.status is here.status is Status.LOCALIZED
+        assert rotation_error_deg(there.T_map_camera, here.T_map_camera) < 0.1
+        assert translation_error(there.T_map_camera, here.T_map_camera) < 0.005
+        assert there.inliers == pytest.approx(here.inliers, rel=0.1)
+        np.testing.assert_array_equal(there.last_render.image().shape, query.image.shape)
+
+
+@pytest.mark.parametrize("name", ["sift", "xfeat", "aliked-lightglue", "disk-lightglue"])
+def test_no_picture_leaves_the_gpu_before_the_pose_is_solved(
+    gpu, renderer, room_camera, room_queries, name, monkeypatch
+) -> None:
+    localizer = Localizer(renderer, MATCHERS[name]("", 2048, gpu.device))
+    left = []
+    judge = localizer._judge
+
+    def note_what_left_until_now(*arguments):
+        left.extend(gpu.to_host)
+        return judge(*arguments)
+
+    monkeypatch.setattr(localizer, "_judge", note_what_left_until_now)
+    query = room_queries[0]
+    image = query.image.copy()
+    image.flags.writeable = False  # as those of messages
+    gpu.reset()
+    estimate = localizer.localize(image, room_camera, query.T_map_camera_prior)
+    assert estimate.status is Status.LOCALIZED
+    assert 0 < max(left) <= SMALL
+    # The photo's corners; of the render at the prior and of those at estimates, matches and the depths under them.
+    assert sum(size > 100 for size in left) == 1 + 2 * (1 + estimate.passes)
+    # The judge compares pictures, on the host.
+    assert max(gpu.to_host) > SMALL
+
+
+def test_a_matcher_on_the_cpu_takes_renders_of_a_gpu(gpu, renderer, room_camera, room_queries) -> None:
+    query = room_queries[0]
+    estimate = Localizer(renderer, create_matcher("sift", device="cpu")).localize(
+        query.image, room_camera, query.T_map_camera_prior
+    )
+    assert estimate.status is Status.LOCALIZED
+    assert translation_error(estimate.T_map_camera, query.T_map_camera) < 0.02
+
+
+def test_a_dark_photo_has_no_answer(gpu, renderer, room_camera, room_queries) -> None:
+    query = room_queries[0]
+    estimate = Localizer(renderer, MATCHERS["sift"]("", 2048, gpu.device)).localize(
+        np.zeros_like(query.image), room_camera, query.T_map_camera_prior
+    )
+    assert estimate.status is Status.FAILED
+    assert "0 features in the photo" in estimate.reason
+
+
+def test_a_render_of_nothing_has_no_answer(gpu, room_map, room_camera, room_queries) -> None:
+    query = room_queries[0]
+    nothing = OnGpu(replace(room_map, means=room_map.means + np.float32([0, 0, 1e4])))
+    estimate = Localizer(nothing, MATCHERS["sift"]("", 2048, gpu.device)).localize(
+        query.image, room_camera, query.T_map_camera_prior
+    )
+    assert estimate.status is Status.FAILED

@@ -1,0 +1,80 @@
+"""The demo, as `make demo` runs it, and what it says when things go wrong."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import cv2
+import numpy as np
+import pytest
+
+from gsfeatloc_ros.client.bag_player import Answer, Topics, play_bag
+from gsfeatloc_ros.simulate import write_bag
+from gsfeatloc_ros.simulate.bag import CAMERA_INFO_TOPIC, IMAGE_TOPIC, PRIOR_TOPIC
+from gsfeatloc_ros.tools.demo import Result, running_localizer, summary
+
+TOPICS = Topics(IMAGE_TOPIC, CAMERA_INFO_TOPIC, PRIOR_TOPIC)
+
+
+def test_demo_localizes_photos_of_a_bag(tmp_path):
+    command = [sys.executable, "-m", "gsfeatloc_ros.tools.demo", "--queries", "3", "--matcher", "sift"]
+    done = subprocess.run([*command, "--out", tmp_path], capture_output=True, text=True, timeout=400)
+    assert done.returncode == 0, done.stdout + done.stderr
+    lines = done.stdout.splitlines()
+    assert sum(line.split()[:1] in (["1"], ["2"], ["3"]) for line in lines) == 3
+    assert lines[-1].startswith("localized 3 of 3 (100 %) within 1 degree and 2 cm; median error 0.")
+    assert cv2.imread(str(tmp_path / "photos.png")).shape[1] > 3 * 640
+    assert "ready" in (tmp_path / "localizer.log").read_text()
+
+
+def answer_to(query, T_map_camera, **evidence) -> Answer:
+    return Answer("100.000000000", T_map_camera, evidence, 250.0)
+
+
+def test_failures_and_wrong_answers_are_not_successes(room_queries):
+    query = room_queries[0]
+    good = Result.of(query, answer_to(query, query.T_map_camera, inliers="99"))
+    wrong = Result.of(query, answer_to(query, query.T_map_camera_prior, inliers="21"))
+    refused = Result.of(query, answer_to(query, None, reason="7 inliers between the photo and the render"))
+    silent = Result.of(query, Answer("100.000000000", None, {}, float("nan")))
+    assert [result.success for result in (good, wrong, refused, silent)] == [True, False, False, False]
+    assert "0.000 deg   0.00 cm        99     250" in good.row(1)
+    assert refused.row(3).endswith("no answer: 7 inliers between the photo and the render")
+    assert silent.row(4).endswith("no answer: none came in time")
+    assert summary([good, good, good, refused]) == (
+        "localized 3 of 4 (75 %) within 1 degree and 2 cm; median error 0.00 degrees, 0.0 cm; median 250 ms"
+    )
+    assert summary([silent]) == "localized 0 of 1 (0 %) within 1 degree and 2 cm; no answers"
+
+
+@pytest.fixture
+def bag(tmp_path, room_camera, room_queries):
+    write_bag(tmp_path / "bag", room_camera, room_queries[:1])
+    return tmp_path / "bag"
+
+
+def test_player_says_when_there_is_no_localizer(bag):
+    with pytest.raises(TimeoutError, match=r"no localizer on .*/prior.* within 0\.5 s"):
+        next(play_bag(bag, TOPICS, is_running=lambda: True, start_timeout=0.5))
+
+
+def test_player_says_when_the_localizer_has_ended(bag, tmp_path):
+    with (
+        running_localizer(tmp_path / "no_such_map.ply", "sift", tmp_path / "log") as process,
+        pytest.raises(RuntimeError, match="the localizer has ended"),
+    ):
+        next(play_bag(bag, TOPICS, is_running=lambda: process.poll() is None))
+    assert "no_such_map.ply" in (tmp_path / "log").read_text()
+
+
+def test_localizer_is_gone_after_the_demo_even_when_it_is_interrupted(room_map_file, tmp_path):
+    with pytest.raises(KeyboardInterrupt), running_localizer(room_map_file, "sift", tmp_path / "log") as process:
+        raise KeyboardInterrupt
+    assert process.poll() is not None
+
+
+def test_no_answer_leaves_the_error_unknown(room_queries):
+    result = Result.of(room_queries[0], answer_to(room_queries[0], None))
+    assert np.isnan(result.error).all()
+    assert result.prior_error[0] > 1

@@ -1,0 +1,134 @@
+"""The typed service, as it is built from interfaces/, and how it is built."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+import rclpy
+from ament_index_python.packages import get_package_share_directory
+from gsfeatloc_interfaces.srv import LocalizeImage
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.serialization import deserialize_message, serialize_message
+
+ROOT = Path(__file__).parents[2]
+STATUSES = {"LOCALIZED": 0, "REJECTED": 1, "FAILED": 2, "REFUSED": 3}
+
+
+def test_request_has_the_fields():
+    assert LocalizeImage.Request.get_fields_and_field_types() == {
+        "image": "sensor_msgs/Image",
+        "camera_info": "sensor_msgs/CameraInfo",
+        "has_prior": "boolean",
+        "prior": "geometry_msgs/PoseWithCovarianceStamped",
+    }
+
+
+def test_response_has_the_fields():
+    assert LocalizeImage.Response.get_fields_and_field_types() == {
+        "status": "uint8",
+        "reason": "string",
+        "pose": "geometry_msgs/PoseWithCovarianceStamped",
+        "inliers": "uint32",
+        "milliseconds": "double",
+    }
+
+
+def test_statuses_are_constants_of_the_response():
+    assert {name: getattr(LocalizeImage.Response, name) for name in STATUSES} == STATUSES
+
+
+def test_empty_request_has_no_prior():
+    request = deserialize_message(serialize_message(LocalizeImage.Request()), LocalizeImage.Request)
+    assert not request.has_prior
+    assert len(request.image.data) == 0
+    assert not np.any(request.prior.pose.covariance)
+
+
+def test_service_answers_over_dds():
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    node = rclpy.create_node("interfaces", context=context)
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(node)
+
+    def answer(request: LocalizeImage.Request, response: LocalizeImage.Response) -> LocalizeImage.Response:
+        response.status = LocalizeImage.Response.REFUSED
+        response.reason = f"{len(request.image.data)} bytes, {request.image.encoding}"
+        response.pose = request.prior
+        return response
+
+    try:
+        node.create_service(LocalizeImage, "localize_image", answer)
+        client = node.create_client(LocalizeImage, "localize_image")
+        assert client.wait_for_service(30.0)
+        request = LocalizeImage.Request(has_prior=True)
+        request.image.data, request.image.encoding = bytes(1920 * 1080 * 3), "rgb8"
+        request.prior.pose.covariance = np.arange(36.0)
+        future = client.call_async(request)
+        executor.spin_until_future_complete(future, 30.0)
+        response = future.result()
+        assert response.status == LocalizeImage.Response.REFUSED
+        assert response.reason == "6220800 bytes, rgb8"
+        assert response.pose.pose.covariance.tolist() == list(range(36))
+    finally:
+        executor.shutdown()
+        node.destroy_node()
+        rclpy.shutdown(context=context)
+
+
+def test_service_file_is_installed_with_its_comments():
+    installed = Path(get_package_share_directory("gsfeatloc_interfaces")) / "srv" / "LocalizeImage.srv"
+    assert installed.read_text() == (ROOT / "interfaces" / "srv" / "LocalizeImage.srv").read_text()
+
+
+def test_manifest_agrees_with_that_of_the_node():
+    node, interfaces = (ElementTree.parse(ROOT / folder / "package.xml").getroot() for folder in ("", "interfaces"))
+    for tag in ("version", "license", "maintainer"):
+        assert interfaces.findtext(tag) == node.findtext(tag)
+    assert interfaces.find("maintainer").get("email") == node.find("maintainer").get("email")
+
+
+def built(root: Path, tools: list[str], headers: bool = True, **environment: str) -> subprocess.CompletedProcess:
+    """What scripts/build.sh gives to colcon (printed, not done) where there are these tools, and Python's headers."""
+    shutil.copytree(ROOT / "scripts", root / "scripts")
+    programs = root / ".venv" / "bin"
+    programs.mkdir(parents=True)
+    (programs / "activate").write_text(f"export VIRTUAL_ENV={root}/.venv PATH={programs}\n")
+    # Says yes when asked for rclpy, and prints what it is to do otherwise.
+    answers = f"*Python.h*) exit {int(not headers)};; -c*) exit 0;; *) echo $*;;"
+    (programs / "python").write_text(f'#!/bin/sh\ncase "$*" in {answers} esac\n')
+    (programs / "python").chmod(0o755)
+    for tool in ["bash", "dirname", *tools]:
+        (programs / tool).symlink_to(shutil.which(tool))
+    return subprocess.run(
+        [root / "scripts" / "build.sh"], env={"PATH": str(programs), **environment}, capture_output=True, text=True
+    )
+
+
+def test_interfaces_are_built_with_the_package(tmp_path):
+    done = built(tmp_path, ["cmake", "c++"])
+    assert done.returncode == 0, done.stderr
+    assert "colcon build --base-paths . interfaces test/support/tf2_msgs --cmake-args" in done.stdout
+    assert done.stderr == ""
+
+
+def test_the_tests_own_tf2_msgs_is_not_built_over_that_of_an_install(tmp_path):
+    done = built(tmp_path, ["cmake", "c++"], ROS_DISTRO="jazzy", AMENT_PREFIX_PATH="/opt/ros/jazzy")
+    assert "colcon build --base-paths . interfaces --cmake-args" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("tools", "headers"), [([], True), (["cmake"], True), (["c++"], True), (["cmake", "c++"], False)]
+)
+def test_where_nothing_can_be_compiled_only_the_package_is_built(tmp_path, tools, headers):
+    done = built(tmp_path, tools, headers)
+    assert done.returncode == 0
+    assert "colcon build --base-paths . --cmake-args" in done.stdout
+    assert done.stderr.count("\n") == 1
+    assert "the service ~/localize_image is off" in done.stderr
+    assert "apt install cmake g++ python3-dev" in done.stderr

@@ -1,0 +1,153 @@
+"""The installed localizer on a robot with tf: priors and answers of its base, the transform from the map to odom."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
+from node_harness import (
+    assert_close,
+    assert_start_fails,
+    connected_client,
+    info_of,
+    matrix_of,
+    prior_of,
+    rgb_image,
+    running_localizer,
+    text,
+)
+
+from gsfeatloc_ros.common.geometry import invert, make_pose, matrix_from_quaternion, so3_exp
+
+# Last: a tf2_ros that is installed comes before it.
+sys.path.append(str(Path(__file__).parents[1] / "support" / "tf2_stand_in"))
+import tf2_ros
+from tf2_msgs.msg import TFMessage
+
+STAND_IN = sys.path[-1]
+HAS_TF2 = not tf2_ros.__file__.startswith(STAND_IN)
+T_ODOM_BASE = make_pose(so3_exp(np.array([0.0, 0.0, 1.2])), [3.0, -1.0, 0.0])
+ALIGNED = {"map__aligned": True, "publish_tf": True, "pose_frame": "base", "prior_frame": "base"}
+
+
+@pytest.fixture
+def tf(monkeypatch):
+    """Let the localizer find tf2_ros."""
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([os.environ["PYTHONPATH"], STAND_IN]))
+
+
+@pytest.fixture
+def T_map_base(query):
+    """The base on the floor under the camera, turned as the camera is."""
+    ahead = query.T_map_camera[:3, 2]
+    yaw = np.arctan2(ahead[1], ahead[0])
+    return make_pose(so3_exp(np.array([0.0, 0.0, yaw])), [*query.T_map_camera[:2, 3], 0.0])
+
+
+def transform(parent: str, child: str, T_parent_child: np.ndarray, stamp) -> TransformStamped:
+    pose = prior_of(T_parent_child).pose
+    message = TransformStamped(child_frame_id=child)
+    message.header.frame_id, message.header.stamp = parent, stamp
+    translation, position = message.transform.translation, pose.position
+    translation.x, translation.y, translation.z = position.x, position.y, position.z
+    message.transform.rotation = pose.orientation
+    return message
+
+
+def tell_where_the_camera_is(client, T_base_camera: np.ndarray) -> tf2_ros.StaticTransformBroadcaster:
+    broadcaster = tf2_ros.StaticTransformBroadcaster(client.node)
+    broadcaster.sendTransform(transform("base_link", "camera_optical", T_base_camera, client.next_stamp()))
+    return broadcaster
+
+
+def test_priors_and_answers_of_the_base_and_tf_from_the_map_to_odom(tf, room_map_file, room_camera, query, T_map_base):
+    off = invert(query.T_map_camera) @ query.T_map_camera_prior
+    T_base_camera = invert(T_map_base) @ query.T_map_camera
+    T_map_odom = T_map_base @ invert(T_ODOM_BASE)
+    with running_localizer(map__path=room_map_file, **ALIGNED) as process, connected_client() as client:
+        static = tell_where_the_camera_is(client, T_base_camera)
+        moving, heard = tf2_ros.TransformBroadcaster(client.node), client.listen(TFMessage, "/tf")
+        client.send_camera_info(info_of(room_camera))
+        client.send_prior(prior_of(T_map_base @ T_base_camera @ off @ invert(T_base_camera)))
+        image = rgb_image(query.image)
+        image.header.stamp = client.next_stamp()
+        moving.sendTransform(transform("odom", "base_link", T_ODOM_BASE, image.header.stamp))
+        client.spin(0.5)
+        client.send_image(image)
+        assert client.spin_until(lambda: text(image) in client.poses), process.output
+        pose = client.poses[text(image)]
+        assert pose.header.frame_id == "map"
+        assert_close(pose, T_map_base)
+        assert (np.linalg.eigvalsh(np.reshape(pose.pose.covariance, (6, 6))) > 0).all()
+
+        # It is told again and again, with stamps that go on, so that it can be used between answers.
+        def told() -> list[TransformStamped]:
+            return [t for message in heard for t in message.transforms if t.child_frame_id == "odom"]
+
+        assert client.spin_until(lambda: len(told()) > 5)
+        last = told()[-1]
+        assert last.header.frame_id == "map"
+        stamps = [t.header.stamp.sec + 1e-9 * t.header.stamp.nanosec for t in told()]
+        assert stamps == sorted(stamps)
+        assert stamps[-1] > stamps[0]
+        t, q = last.transform.translation, last.transform.rotation
+        found = make_pose(matrix_from_quaternion([q.x, q.y, q.z, q.w]), [t.x, t.y, t.z])
+        # The base is where the pose says.
+        np.testing.assert_allclose(found @ T_ODOM_BASE, matrix_of(pose), atol=1e-9)
+        np.testing.assert_allclose(found, T_map_odom, atol=0.1)
+        client.node.destroy_publisher(static)  # kept until here: static transforms come from who told them
+
+
+def test_initialpose_as_rviz_sends_it(tf, room_map_file, room_camera, query, T_map_base):
+    """On the floor, a little off, with RViz's covariance: z, roll and pitch exactly known."""
+    with running_localizer(map__path=room_map_file) as process, connected_client() as client:
+        static = tell_where_the_camera_is(client, invert(T_map_base) @ query.T_map_camera)
+        client.send_camera_info(info_of(room_camera))
+        off = make_pose(so3_exp(np.array([0.0, 0.0, 0.3])), [0.2, -0.3, 0.0])
+        message = PoseWithCovarianceStamped()
+        message.header.frame_id = "map"
+        message.pose.pose = prior_of(T_map_base @ off).pose
+        message.pose.covariance[0] = message.pose.covariance[7] = 0.25
+        message.pose.covariance[35] = 0.06853891909122467
+        client.publish("initialpose", message)
+        image = rgb_image(query.image)
+        answer = client.attempt(image)
+        assert answer.ok, f"{answer.reason}\n{process.output}"
+        assert_close(client.pose_of(image), query.T_map_camera)
+        client.node.destroy_publisher(static)
+
+
+def test_a_prior_in_the_frame_of_odom(tf, room_map_file, room_camera, query):
+    T_map_odom = make_pose(so3_exp(np.array([0.1, -0.2, 2.0])), [4.0, 5.0, -1.0])
+    with running_localizer(map__path=room_map_file) as process, connected_client() as client:
+        static = tf2_ros.StaticTransformBroadcaster(client.node)
+        static.sendTransform(transform("map", "odom", T_map_odom, client.next_stamp()))
+        client.send_camera_info(info_of(room_camera))
+        client.send_prior(prior_of(invert(T_map_odom) @ query.T_map_camera_prior, "odom"))
+        image = rgb_image(query.image)
+        assert client.attempt(image).ok, process.output
+        assert_close(client.pose_of(image), query.T_map_camera)
+
+
+def test_a_camera_that_tf_does_not_know(tf, room_map_file, room_camera, query):
+    with running_localizer(map__path=room_map_file, pose_frame="base"), connected_client() as client:
+        client.send_camera_info(info_of(room_camera))
+        client.send_prior(prior_of(query.T_map_camera_prior))
+        image = rgb_image(query.image)
+        refused = client.attempt(image)
+        assert refused.values["status"] == "refused"
+        assert "tf has no transform from 'base_link' to 'camera_optical'" in refused.reason
+        assert client.pose_of(image) is None
+
+
+def test_tf_is_not_told_of_a_map_that_nobody_aligned(tf, room_map_file):
+    assert_start_fails("publish_tf needs map.aligned", map__path=room_map_file, publish_tf=True)
+
+
+@pytest.mark.skipif(HAS_TF2, reason="tf2_ros is installed here")
+def test_without_tf2_ros_it_says_what_to_install(room_map_file):
+    assert_start_fails("apt install ros-jazzy-tf2-ros", map__path=room_map_file, pose_frame="base")

@@ -1,0 +1,99 @@
+"""The installed localizer with a map whose file is in another frame and unit than the robot's."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from node_harness import (
+    assert_start_fails,
+    connected_client,
+    info_of,
+    matrix_of,
+    prior_of,
+    rgb_image,
+    running_localizer,
+)
+
+from gsfeatloc_ros.common.geometry import quaternion_from_matrix, rotation_error_deg, so3_exp, translation_error
+from gsfeatloc_ros.maps import Similarity
+from gsfeatloc_ros.node.parameters import PARAMETERS, map_alignment
+
+DEFAULTS = {parameter.name: parameter.default for parameter in PARAMETERS}
+# Of the room's file in the robot's frame.
+ALIGNMENT = Similarity(2.5, so3_exp(np.array([0.4, -1.1, 2.0])), np.array([12.0, -7.0, 3.0]))
+
+
+def numbers(values) -> str:
+    return str([float(value) for value in values])
+
+
+def test_alignment_without_parameters_is_none():
+    alignment = map_alignment(DEFAULTS)
+    assert alignment.scale == 1.0
+    assert (alignment.rotation == np.eye(3)).all()
+    assert (alignment.translation == 0).all()
+
+
+def test_quaternion_is_normalized():
+    alignment = map_alignment(DEFAULTS | {"map.rotation": [0.0, 0.0, 5.0, 5.0]})
+    np.testing.assert_allclose(alignment.rotation, so3_exp(np.array([0, 0, np.pi / 2])), atol=1e-12)
+
+
+@pytest.mark.parametrize("transforms", [False, True])
+def test_alignment_is_scale_then_rotation_then_translation_after_nerfstudio(tmp_path, transforms):
+    values = DEFAULTS | {
+        "map.scale": ALIGNMENT.scale,
+        "map.rotation": quaternion_from_matrix(ALIGNMENT.rotation).tolist(),
+        "map.translation": ALIGNMENT.translation.tolist(),
+    }
+    points = np.random.default_rng(0).normal(size=(20, 3))
+    in_data = points
+    if transforms:
+        path = tmp_path / "dataparser_transforms.json"
+        turn, shift = so3_exp(np.array([0.3, 0.2, -0.9])), np.array([1.0, 2.0, 3.0])
+        path.write_text(json.dumps({"transform": np.column_stack([turn, shift]).tolist(), "scale": 0.25}))
+        values["map.dataparser_transforms"] = str(path)
+        in_data = (points / 0.25 - shift) @ turn  # x_splat = scale * (turn @ x_data + shift), undone
+    expected = 2.5 * in_data @ ALIGNMENT.rotation.T + ALIGNMENT.translation
+    np.testing.assert_allclose(map_alignment(values).transform(points), expected, atol=1e-9)
+
+
+def test_answers_are_in_the_frame_of_the_robot(room_map_file, room_camera, room_queries):
+    parameters = {
+        "map__path": room_map_file,
+        "map__scale": ALIGNMENT.scale,
+        "map__rotation": numbers(quaternion_from_matrix(ALIGNMENT.rotation)),
+        "map__translation": numbers(ALIGNMENT.translation),
+        "matcher__name": "sift",
+        "localizer__prior_translation": 1.25,
+    }
+    with running_localizer(**parameters) as process, connected_client() as client:
+        client.send_camera_info(info_of(room_camera))
+        for query in room_queries[:2]:
+            client.send_prior(prior_of(ALIGNMENT.transform_pose(query.T_map_camera_prior)))
+            message = rgb_image(query.image)
+            answer = client.attempt(message)
+            assert answer.ok, f"{answer.reason}\n{process.output}"
+            pose, truth = matrix_of(client.pose_of(message)), ALIGNMENT.transform_pose(query.T_map_camera)
+            assert rotation_error_deg(pose, truth) < 1.0
+            assert translation_error(pose, truth) < 0.02 * ALIGNMENT.scale
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "says"),
+    [
+        ("map__scale", "0.0", "map.scale"),
+        ("map__scale", "-1.0", "map.scale"),
+        ("map__translation", "[1.0, 2.0]", "parameter map.translation: [1.0, 2.0] is not 3 finite numbers"),
+        ("map__translation", "[1.0, 2.0, .nan]", "parameter map.translation: [1.0, 2.0, nan] is not 3 finite numbers"),
+        ("map__translation", "[1, 2, 3]", "expecting type 'DOUBLE_ARRAY'"),
+        ("map__rotation", "[0.0, 0.0, 1.0]", "parameter map.rotation: [0.0, 0.0, 1.0] is not 4 finite numbers"),
+        ("map__rotation", "[0.0, 0.0, 0.0, 0.0]", "parameter map.rotation: quaternion [0.0, 0.0, 0.0, 0.0] has no"),
+        ("map__rotation", "[0.0, .inf, 0.0, 1.0]", "parameter map.rotation: [0.0, inf, 0.0, 1.0] is not 4 finite"),
+        ("map__dataparser_transforms", "/nowhere/transforms.json", "/nowhere/transforms.json: cannot be read"),
+    ],
+)
+def test_frame_that_is_none_ends_the_start_with_one_line(room_map_file, name, value, says):
+    assert_start_fails(says, map__path=room_map_file, **{name: value})

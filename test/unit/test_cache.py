@@ -1,0 +1,227 @@
+"""Prepared maps in files beside the maps."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+from dataclasses import fields
+from pathlib import Path
+
+import map_files
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from gsfeatloc_ros.common.geometry import so3_exp
+from gsfeatloc_ros.maps import MapError, Similarity, load_map
+from gsfeatloc_ros.maps.ply import write_ply
+from gsfeatloc_ros.render import cache
+from gsfeatloc_ros.render.cache import load_prepared
+from gsfeatloc_ros.render.prepare import PreparedMap, prepare
+from gsfeatloc_ros.simulate.two_rooms import two_rooms
+
+ARRAYS = [field.name for field in fields(PreparedMap) if "ndarray" in str(field.type)]
+
+
+@pytest.fixture
+def map_file(tmp_path) -> Path:
+    path = tmp_path / "map.ply"
+    write_ply(path, two_rooms(1000))
+    return path
+
+
+@pytest.fixture
+def preparations(monkeypatch) -> list[PreparedMap]:
+    """The maps that were prepared, not read from a cache, since the test began."""
+    done = []
+
+    def counted(gaussian_map):
+        done.append(prepare(gaussian_map))
+        return done[-1]
+
+    monkeypatch.setattr(cache, "prepare", counted)
+    return done
+
+
+def cache_of(map_path: Path) -> Path:
+    return map_path.with_name(map_path.name + ".gsfeatloc-cache")
+
+
+def assert_same(one: PreparedMap, other: PreparedMap) -> None:
+    for name in ARRAYS:
+        a, b = getattr(one, name), getattr(other, name)
+        assert (a.dtype, a.shape) == (b.dtype, b.shape)
+        # The bits: of what fills up the last chunk some may be NaN.
+        assert a.tobytes() == b.tobytes()
+    assert one.antialiased == other.antialiased
+
+
+def test_second_time_the_map_comes_from_the_cache(map_file, preparations):
+    first, second = load_prepared(map_file), load_prepared(map_file)
+    assert len(preparations) == 1
+    assert_same(first, second)
+    assert_same(second, prepare(load_map(map_file)))
+    assert sorted(path.name for path in map_file.parent.iterdir()) == ["map.ply", "map.ply.gsfeatloc-cache"]
+
+
+def test_arrays_from_the_cache_are_like_new_ones(map_file):
+    """Numba compiles again for arrays that are not writable or not contiguous."""
+    load_prepared(map_file)
+    for name in ARRAYS:
+        array = getattr(load_prepared(map_file), name)
+        assert type(array) is np.ndarray
+        assert array.flags.c_contiguous
+        assert array.flags.writeable
+        assert array.flags.aligned
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_antialiased_flag_is_kept(tmp_path, antialiased):
+    path = tmp_path / "map.ply"
+    gaussian_map = two_rooms(300)
+    object.__setattr__(gaussian_map, "antialiased", antialiased)
+    write_ply(path, gaussian_map)
+    assert [load_prepared(path).antialiased for _ in range(2)] == [antialiased] * 2
+
+
+def test_map_without_visible_gaussians_is_kept(tmp_path, preparations):
+    path = tmp_path / "map.ply"
+    gaussian_map = two_rooms(300)
+    gaussian_map.opacities[:] = 0
+    write_ply(path, gaussian_map)
+    assert_same(load_prepared(path), load_prepared(path))
+    assert len(preparations) == 1
+
+
+def test_alignment_is_no_part_of_the_cache(map_file, preparations):
+    alignment = Similarity(2.0, so3_exp(np.array([0.1, 0.2, 0.3])), np.ones(3))
+    assert load_prepared(map_file).S_map_splat.scale == 1.0
+    assert load_prepared(map_file, alignment).S_map_splat is alignment
+    assert load_prepared(map_file).S_map_splat.scale == 1.0
+    assert len(preparations) == 1
+
+
+def test_changed_map_is_prepared_again(map_file, preparations):
+    load_prepared(map_file)
+    write_ply(map_file, two_rooms(1000, seed=1))
+    changed = load_prepared(map_file)
+    assert len(preparations) == 2
+    assert_same(changed, prepare(load_map(map_file)))
+    load_prepared(map_file)
+    assert len(preparations) == 2
+
+
+def test_other_map_of_the_same_size_and_time_is_prepared_again(map_file, preparations):
+    """As in images of containers, where all files are of one second."""
+    times = 10**18, 10**18
+    os.utime(map_file, ns=times)
+    load_prepared(map_file)
+    write_ply(map_file, two_rooms(1000, seed=1))
+    os.utime(map_file, ns=times)
+    assert_same(load_prepared(map_file), prepare(load_map(map_file)))
+    assert len(preparations) == 2
+
+
+def test_other_version_of_the_code_prepares_again(map_file, preparations, monkeypatch):
+    load_prepared(map_file)
+    monkeypatch.setattr(cache, "_code", lambda: "other")
+    load_prepared(map_file)
+    assert len(preparations) == 2
+
+
+def test_unbundled_sog_is_prepared_again_when_any_of_its_files_changes(tmp_path, preparations):
+    folder = tmp_path / "scene"
+    folder.mkdir()
+    map_files.write_sog(folder, map_files.sample_map(300, sh_degree=1, seed=0), version=2)
+    load_prepared(folder)
+    load_prepared(folder)
+    assert len(preparations) == 1
+    assert cache_of(folder).is_file()
+    image = next(folder.glob("*.webp"))
+    os.utime(image, ns=(1, 1))
+    load_prepared(folder)
+    assert len(preparations) == 2
+
+
+def test_map_named_in_the_working_directory(map_file, preparations, monkeypatch):
+    monkeypatch.chdir(map_file.parent)
+    load_prepared("map.ply")
+    load_prepared(map_file)
+    assert len(preparations) == 1
+
+
+@pytest.mark.parametrize("path", ["nowhere.ply", "", "empty.ply", "/dev/null"])
+def test_map_that_cannot_be_read_leaves_no_cache(tmp_path, path):
+    (tmp_path / "empty.ply").touch()
+    with pytest.raises(MapError):
+        load_prepared(tmp_path / path)
+    assert not list(tmp_path.rglob("*gsfeatloc-cache*"))
+    assert not Path("/dev/null.gsfeatloc-cache").exists()
+
+
+def test_cache_that_cannot_be_written_is_no_error(map_file, caplog):
+    """A folder is in the way, which stops root as well."""
+    in_the_way = cache_of(map_file).with_name(f"{cache_of(map_file).name}.{os.getpid()}")
+    in_the_way.mkdir()
+    with caplog.at_level(logging.DEBUG):
+        prepared = load_prepared(map_file)
+    assert_same(prepared, prepare(load_map(map_file)))
+    assert [record.levelno for record in caplog.records if record.name == cache.__name__] == [logging.DEBUG]
+    assert not cache_of(map_file).exists()
+
+
+def damaged_copies(content: bytes) -> dict[str, bytes]:
+    header = content.index(b"{")
+    return {
+        "empty": b"",
+        "of something else": b"ply\nformat ascii 1.0\n" * 50,
+        "cut in the header": content[: header + 30],
+        "cut in the arrays": content[:-1000],
+        "longer": content + b"\0",
+        "with a hole": content[:-5000] + bytes(5000),
+        "with an endless header": content[: header - 4] + b"\xff" * 4 + content[header:],
+        "with a header of lists": content[:header] + b"[" * (len(content) - header),
+    }
+
+
+@pytest.mark.parametrize("kind", damaged_copies(b"{").keys())
+def test_damaged_cache_is_said_once_and_replaced(map_file, preparations, caplog, kind):
+    expected = load_prepared(map_file)
+    path = cache_of(map_file)
+    good = path.read_bytes()
+    path.write_bytes(damaged_copies(good)[kind])
+    caplog.clear()
+    assert_same(load_prepared(map_file), expected)
+    assert len(preparations) == 2
+    assert [record.levelno for record in caplog.records] == [logging.WARNING]
+    assert str(path) in caplog.text
+    assert path.read_bytes() == good
+
+
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_no_flipped_byte_goes_unnoticed(map_file, data):
+    expected = load_prepared(map_file)
+    path = cache_of(map_file)
+    content = bytearray(path.read_bytes())
+    # As often in what precedes the arrays as in them.
+    places = st.one_of(st.integers(0, 800), st.integers(0, len(content) - 1))
+    content[data.draw(places)] ^= data.draw(st.integers(1, 255))
+    path.write_bytes(content)
+    assert_same(load_prepared(map_file), expected)
+
+
+def test_header_that_claims_much_takes_no_memory(map_file, caplog):
+    load_prepared(map_file)
+    path = cache_of(map_file)
+    content = path.read_bytes()
+    start = content.index(b"{")
+    length = int.from_bytes(content[start - 4 : start], "little")
+    header = json.loads(content[start : start + length])
+    header["arrays"]["sh"] = ["<f2", [10**9, 48, 256]]
+    encoded = json.dumps(header).encode()
+    path.write_bytes(content[: start - 4] + len(encoded).to_bytes(4, "little") + encoded + content[start + length :])
+    load_prepared(map_file)
+    assert "is truncated" in caplog.text

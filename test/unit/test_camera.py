@@ -1,0 +1,150 @@
+"""The pinhole camera and its distortion."""
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from gsfeatloc_ros.common.camera import Camera
+
+K = np.array([[520.0, 0.0, 322.3], [0.0, 515.0, 236.7], [0.0, 0.0, 1.0]])
+
+cameras = st.builds(
+    lambda width, height, focal, cx, cy: Camera(
+        width, height, np.array([[focal * width, 0, cx * width], [0, 1.1 * focal * width, cy * height], [0, 0, 1]])
+    ),
+    st.integers(1, 4000),
+    st.integers(1, 4000),
+    st.floats(0.3, 3),
+    st.floats(0.2, 0.8),
+    st.floats(0.2, 0.8),
+)
+points_in_front = arrays(np.float64, (5, 3), elements=st.floats(-2, 2)).map(lambda points: points + np.array([0, 0, 4]))
+
+# Real lenses: a webcam, a wide rational one, a fisheye.
+LENSES = [
+    ("plumb_bob", [-0.28, 0.09, 0.0012, -0.0008, -0.01]),
+    ("plumb_bob", [0.1, -0.2, 0.001, 0.0005]),
+    ("rational_polynomial", [3.1, 1.2, 0.0003, -0.0001, 0.05, 3.4, 2.2, 0.3]),
+    ("equidistant", [-0.02, 0.004, -0.003, 0.0005]),
+]
+
+
+def distort(camera: Camera, points: np.ndarray) -> np.ndarray:
+    """Observed pixels of camera-frame points by OpenCV's forward model."""
+    zero = np.zeros(3)
+    if camera.model == "equidistant":
+        pixels, _ = cv2.fisheye.projectPoints(points[:, None], zero, zero, camera.K, camera.distortion)
+    else:
+        pixels, _ = cv2.projectPoints(points[:, None], zero, zero, camera.K, camera.distortion)
+    return pixels.reshape(-1, 2)
+
+
+def test_projection_by_hand():
+    pixels = Camera(640, 480, K).project(np.array([[0.0, 0.0, 2.0], [0.2, -0.4, 2.0]]))
+    np.testing.assert_allclose(pixels, [[322.3, 236.7], [322.3 + 52.0, 236.7 - 103.0]])
+
+
+@given(cameras, points_in_front)
+def test_rays_go_through_the_pixels_of_points(camera, points):
+    rays = camera.rays(camera.project(points))
+    np.testing.assert_allclose(rays * points[:, 2:], points, atol=1e-9)
+
+
+@pytest.mark.parametrize(("model", "coefficients"), LENSES)
+def test_undistort_inverts_the_lens(model, coefficients):
+    camera = Camera(640, 480, K, np.array(coefficients), model)
+    columns, rows = np.meshgrid(np.linspace(0, 639, 9), np.linspace(0, 479, 9))
+    pinhole = np.column_stack([columns.ravel(), rows.ravel()])
+    observed = distort(camera, camera.rays(pinhole))
+    assert np.abs(observed - pinhole).max() > 2  # the lens does something
+    np.testing.assert_allclose(camera.undistort(observed), pinhole, atol=1e-3)
+
+
+@pytest.mark.parametrize(("model", "coefficients"), LENSES)
+def test_undistort_of_no_pixels(model, coefficients):
+    assert Camera(640, 480, K, np.array(coefficients), model).undistort(np.zeros((0, 2))).shape == (0, 2)
+
+
+@pytest.mark.parametrize("distortion", [[], [0, 0, 0, 0], [0, 0, 0, 0, 0]])
+def test_without_distortion_pixels_stay(distortion):
+    pixels = np.random.default_rng(0).uniform(0, 480, (10, 2))
+    undistorted = Camera(640, 480, K, np.array(distortion)).undistort(pixels)
+    np.testing.assert_array_equal(undistorted, pixels)
+    assert undistorted is not pixels
+
+
+def test_equidistant_without_coefficients_is_still_a_fisheye():
+    # The equidistant model r = f theta is not a pinhole even when all its coefficients are zero.
+    camera = Camera(640, 480, K, np.zeros(4), "equidistant")
+    points = np.array([[1.0, 0.5, 1.0], [-0.6, 0.4, 1.0]])
+    np.testing.assert_allclose(camera.undistort(distort(camera, points)), camera.project(points), atol=1e-6)
+
+
+@given(cameras, points_in_front, st.integers(1, 4000), st.integers(1, 4000))
+def test_scaling_maps_pixels_as_resizing_an_image_does(camera, points, width, height):
+    scale = np.array([width / camera.width, height / camera.height])
+    # Resizing keeps the image's borders, which lie half a pixel outside the centres of its border pixels.
+    expected = (camera.project(points) + 0.5) * scale - 0.5
+    np.testing.assert_allclose(camera.scaled(width, height).project(points), expected, atol=1e-6)
+
+
+def test_scaling_agrees_with_cv2_resize():
+    image = np.zeros((480, 640), dtype=np.float32)
+    image[200:204, 320:324] = 1.0  # a spot of 4x4 pixels, its centre at (321.5, 201.5)
+    small = cv2.resize(image, (160, 120), interpolation=cv2.INTER_AREA)
+    rows, columns = np.nonzero(small)
+    camera = Camera(640, 480, np.array([[500.0, 0, 321.5], [0, 500.0, 201.5], [0, 0, 1]]))
+    np.testing.assert_allclose(camera.scaled(160, 120).K[:2, 2], [columns[0], rows[0]])
+    assert len(rows) == 1
+
+
+@given(cameras, st.integers(1, 4000))
+def test_scaling_back_gives_the_camera(camera, width):
+    again = camera.scaled(width, 480).scaled(camera.width, camera.height)
+    assert (again.width, again.height) == (camera.width, camera.height)
+    np.testing.assert_allclose(again.K, camera.K, rtol=1e-9, atol=1e-6)
+
+
+@given(cameras, st.integers(1, 4000))
+def test_limited_keeps_the_proportions(camera, max_width):
+    limited = camera.limited(max_width)
+    assert limited.width == min(camera.width, max_width)
+    if limited is not camera:
+        assert abs(limited.height - max(1, camera.height * max_width / camera.width)) <= 0.5
+        assert limited.fov_x == pytest.approx(camera.fov_x)
+
+
+def test_scaling_keeps_the_lens():
+    model, coefficients = LENSES[0]
+    camera = Camera(640, 480, K, np.array(coefficients), model)
+    points = np.array([[0.5, 0.3, 1.0]])
+    small = camera.scaled(320, 240)
+    np.testing.assert_allclose(distort(small, points), (distort(camera, points) + 0.5) / 2 - 0.5, atol=1e-9)
+
+
+def test_field_of_view():
+    assert Camera(640, 480, np.diag([320.0, 320.0, 1.0])).fov_x == pytest.approx(np.pi / 2)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"width": 0}, "size"),
+        ({"height": -1}, "size"),
+        ({"K": np.zeros((3, 3))}, "calibrate"),
+        ({"K": np.diag([500.0, -500.0, 1.0])}, "focal"),
+        ({"K": np.diag([500.0, np.nan, 1.0])}, "finite"),
+        ({"K": np.diag([500.0, 500.0, 2.0])}, "upper triangular"),
+        ({"K": K.T}, "upper triangular"),
+        ({"distortion": np.array([np.inf, 0, 0, 0])}, "finite"),
+        ({"distortion": np.zeros(3)}, "coefficients"),
+        ({"distortion": np.zeros(5), "model": "equidistant"}, "coefficients"),
+        ({"model": "kannala"}, "model"),
+    ],
+)
+def test_a_camera_that_cannot_be_is_refused(change, message):
+    with pytest.raises(ValueError, match=message):
+        Camera(**({"width": 640, "height": 480, "K": K} | change))

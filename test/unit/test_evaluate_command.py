@@ -1,0 +1,346 @@
+"""The command: what it writes and prints, several processes, and going on where it was interrupted."""
+
+import json
+from dataclasses import asdict, fields
+
+import joblib
+import numpy as np
+import pytest
+from room_datasets import write_nerfstudio
+
+from gsfeatloc_ros.common.geometry import quaternion_from_matrix
+from gsfeatloc_ros.evaluate.record import fingerprint_of, hash_scene
+from gsfeatloc_ros.evaluate.run import Run, draw_priors
+from gsfeatloc_ros.evaluate.scene import load_scene
+from gsfeatloc_ros.localize.localizer import LocalizerOptions
+from gsfeatloc_ros.maps import load_map
+from gsfeatloc_ros.maps.ply import write_ply
+from gsfeatloc_ros.simulate import simulate_queries
+from gsfeatloc_ros.tools.evaluate import main
+
+# The room is small for the paper's priors: a lesser sigma keeps them out of the walls.
+QUICK = ["--matcher", "sift", "--sigma", "0.3"]
+
+
+@pytest.fixture(scope="module")
+def queries(room, room_camera):
+    return simulate_queries(room, room_camera.scaled(320, 240), count=4, seed=5)
+
+
+@pytest.fixture
+def room_scene(tmp_path, room_camera, queries, room_map_file):
+    folder = tmp_path / "room"
+    folder.mkdir()
+    return write_nerfstudio(folder, room_camera.scaled(320, 240), queries, room_map_file)
+
+
+def read(path):
+    return json.loads(path.read_text())
+
+
+def without_times(report):
+    """Results without what no two runs have in common."""
+    return [
+        {key: value for key, value in result.items() if "milliseconds" not in key} for result in report["per_query"]
+    ]
+
+
+def test_several_of_everything_in_one_call(room_scene, tmp_path, capsys):
+    path = tmp_path / "all.json"
+    lists = ["--method", "default,published", "--seed", "3-4", "--protocol", "paper,chen", "--limit", "1"]
+    assert main([str(room_scene), *QUICK, *lists, "--json", str(path)]) == 0
+    report = read(path)
+    combinations = [(run["method"], run["protocol"], run["seed"]) for run in report["runs"]]
+    assert sorted(combinations) == [
+        (method, protocol, seed)
+        for method in ("default", "published")
+        for protocol in ("chen", "paper")
+        for seed in (3, 4)
+    ]
+    for run in report["runs"]:
+        assert len(run["per_query"]) == run["queries"] == (5 if run["protocol"] == "chen" else 1)
+        assert [result["step"] for result in run["per_query"]] == list(range(run["queries"]))
+        if run["protocol"] == "chen":
+            assert run["best_of_priors"]["queries"] == 1
+            assert run["best_of_priors"]["success_rate"] >= run["success_rate"]
+        assert (run["coverage"] is None) == (run["method"] == "published")
+    pooled = {(group["method"], group["protocol"]): group for group in report["pooled"]}
+    assert len(pooled) == len(report["pooled"]) == 4
+    assert pooled["default", "chen"]["seed"] == "3,4"
+    assert pooled["default", "chen"]["queries"] == 10
+    assert pooled["default", "chen"]["best_of_priors"]["queries"] == 2
+    table = capsys.readouterr().out.splitlines()
+    assert len(table) == 5
+    assert table[0].split()[:3] == ["scene", "protocol", "sigma"]
+    assert all(line.startswith("room") for line in table[1:])
+
+
+def test_sweep_is_reported_by_step(room_scene, tmp_path, capsys):
+    path = tmp_path / "sweep.json"
+    assert main([str(room_scene), *QUICK, "--protocol", "sweep-rotation", "--limit", "1", "--json", str(path)]) == 0
+    report = read(path)
+    assert [step["queries"] for step in report["steps"]] == [1] * 11
+    errors = [step["prior_rotation_error_deg"] for step in report["steps"]]
+    np.testing.assert_allclose(errors, np.linspace(0, errors[-1], 11), atol=1e-4)
+    assert report["steps"][0]["success_rate"] == 1.0
+    assert capsys.readouterr().out.count("prior off by") == 11
+
+
+def test_priors_of_another_system(room_scene, queries, tmp_path):
+    path = tmp_path / "report.json"
+    prior = queries[2].T_map_camera_prior
+    numbers = [*prior[:3, 3], *quaternion_from_matrix(prior[:3, :3])]
+    (tmp_path / "odometry.txt").write_text(f"2 {' '.join(map(str, numbers))}\n")
+    options = ["--protocol", "priors-file", "--priors", str(tmp_path / "odometry.txt")]
+    assert main([str(room_scene), *QUICK, *options, "--json", str(path)]) == 0
+    (result,) = read(path)["per_query"]
+    assert result["photo"] == "2.png"
+    assert 10 <= result["prior_rotation_error_deg"] <= 30
+    assert result["success"]
+
+
+def test_options_of_the_localizer_are_changed(room_scene, tmp_path):
+    path = tmp_path / "inliers.json"
+    lists = ["--method", "default,published", "--set", "min_inliers=20,5000", "--set", "max_views=0", "--limit", "1"]
+    assert main([str(room_scene), *QUICK, *lists, "--json", str(path)]) == 0
+    runs = read(path)["runs"]
+    assert [(run["method"], run["options"]) for run in runs] == [
+        ("default", {"min_inliers": 20, "max_views": 0}),
+        ("default", {"min_inliers": 5000, "max_views": 0}),
+        ("published", {}),
+    ]
+    assert [run["answered"] for run in runs[:2]] == [1, 0]
+
+
+def test_pieces_are_left_out_and_photos_spoilt_one_at_a_time(room_scene, tmp_path):
+    path = tmp_path / "worse.json"
+    lists = ["--without", "nothing,sub-pixel", "--spoil", "nothing,dark", "--limit", "1"]
+    assert main([str(room_scene), *QUICK, "--method", "default,published", *lists, "--json", str(path)]) == 0
+    runs = read(path)["runs"]
+    assert [(run["method"], run["without"], run["spoil"]) for run in runs] == [
+        ("default", "", ""),
+        ("default", "", "dark"),
+        ("default", "sub-pixel", ""),
+        ("default", "sub-pixel", "dark"),
+        ("published", "", ""),
+        ("published", "", "dark"),
+    ]
+    errors = [run["per_query"][0]["rotation_error_deg"] for run in runs]
+    assert len(set(errors)) == len(errors)
+
+
+def test_two_processes_find_what_one_does(room_scene, tmp_path):
+    for jobs in ("1", "2"):
+        assert main([str(room_scene), *QUICK, "--jobs", jobs, "--json", str(tmp_path / f"{jobs}.json")]) == 0
+    one, two = (read(tmp_path / f"{jobs}.json") for jobs in "12")
+    assert one["queries"] == 4
+    assert without_times(one) == without_times(two)
+
+
+def test_joblibs_own_configuration_chooses_the_backend(room_scene, tmp_path):
+    path = tmp_path / "report.json"
+    with joblib.parallel_config(backend="threading", n_jobs=2):
+        assert main([str(room_scene), *QUICK, "--limit", "2", "--json", str(path)]) == 0
+    assert read(path)["queries"] == 2
+
+
+# Going on
+
+
+def test_what_is_done_is_not_done_again(room_scene, tmp_path, capsys):
+    path = tmp_path / "report.json"
+    arguments = [str(room_scene), *QUICK, "--json", str(path)]
+    assert main([*arguments, "--limit", "2"]) == 0
+    lines = path.with_suffix(".jsonl").read_text().splitlines()
+    first = read(path)
+    assert main([*arguments, "--limit", "3"]) == 0
+    assert "has 2 of the 3 results already" in capsys.readouterr().out
+    again = read(path)
+    # The very times are those of the first run.
+    assert again["per_query"][:2] == first["per_query"]
+    assert path.with_suffix(".jsonl").read_text().splitlines()[:3] == lines
+    assert main([*arguments, "--limit", "1"]) == 0
+    assert read(path)["per_query"] == first["per_query"][:1]
+
+
+def test_a_line_cut_short_is_done_again(room_scene, tmp_path, capsys):
+    path = tmp_path / "report.json"
+    record = path.with_suffix(".jsonl")
+    arguments = [str(room_scene), *QUICK, "--limit", "2", "--json", str(path)]
+    assert main(arguments) == 0
+    first = read(path)
+    record.write_text(record.read_text()[:-40])
+    assert main(arguments) == 0
+    assert "has 1 of the 2 results already" in capsys.readouterr().out
+    assert without_times(read(path)) == without_times(first)
+    assert main(arguments) == 0
+    assert "has 2 of the 2 results already" in capsys.readouterr().out
+
+
+def test_another_setting_starts_over_and_keeps_the_others(room_scene, tmp_path, capsys):
+    path = tmp_path / "report.json"
+    for seed, there in (("0", ""), ("1", "has 0 of the 1 results already"), ("0", "has 1 of the 1 results already")):
+        arguments = [str(room_scene), *QUICK, "--limit", "1", "--seed", seed, "--json", str(path)]
+        assert main(arguments) == 0
+        printed = capsys.readouterr().out
+        assert there in printed
+        assert ("already" in printed) == bool(there)
+        assert read(path)["seed"] == int(seed)
+
+
+def test_another_map_starts_over(room_scene, tmp_path, capsys):
+    path = tmp_path / "report.json"
+    arguments = [str(room_scene), *QUICK, "--limit", "1", "--json", str(path)]
+    assert main(arguments) == 0
+    first = read(path)
+    gaussians = load_map(room_scene / "map.ply")
+    gaussians.means[:, 0] += 0.5
+    write_ply(room_scene / "map.ply", gaussians)
+    capsys.readouterr()
+    assert main(arguments) == 0
+    printed = capsys.readouterr().out
+    assert "map changed, 1 results start over" in printed
+    # It is the new map that was localized in, half a metre off.
+    moved = read(path)["per_query"][0]["translation_error"] - first["per_query"][0]["translation_error"]
+    assert moved * radius(room_scene) == pytest.approx(0.5, abs=0.1)
+
+
+def radius(folder):
+    centres = load_scene(folder).trajectory[:, :3, 3]
+    return np.linalg.norm(centres - centres.mean(axis=0), axis=1).mean()
+
+
+def test_fingerprint_knows_what_results_depend_on(room_scene, monkeypatch):
+    def fingerprint(sigma=1.0):
+        run = Run(room_scene, None, "paper", None, "default", "sift", sigma, 0, 640)
+        scene = load_scene(room_scene)
+        return fingerprint_of(run, hash_scene(scene), draw_priors(run, scene))
+
+    def differ(before, after):
+        return [part for part, value in asdict(before).items() if value != asdict(after)[part]]
+
+    before = fingerprint()
+    assert fingerprint() == before
+    assert differ(before, fingerprint(sigma=2.0)) == ["settings", "priors"]
+    monkeypatch.setattr("gsfeatloc_ros.evaluate.record._code", lambda: "newer")
+    assert differ(before, fingerprint()) == ["code"]
+    transforms = read(room_scene / "transforms.json")
+    (room_scene / "transforms.json").write_text(json.dumps(transforms | {"cx": 160.0}))
+    assert differ(before, fingerprint()) == ["code", "photos"]
+
+
+# What the command refuses
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (["--matcher", "sift,nothing"], "nothing is not one of sift"),
+        (["--method", "other"], "other is not one of default, published"),
+        (["--protocol", "chan"], "chan is not one of paper"),
+        (["--seed", "0-x"], "'0-x' is not a number"),
+        (["--seed", ""], "'' is not a number"),
+        (["--sigma", "1,-1"], "'-1' is not a number of at least 0"),
+        (["--set", "passes=1"], "passes=1 is not OPTION=VALUE"),
+        (["--set", "max_passes"], "max_passes is not OPTION=VALUE"),
+        (["--set", "max_passes=1.5"], "'1.5' is not a number"),
+        (["--set", "seed=1"], "seed=1 is not OPTION=VALUE"),
+        (["--jobs", "0"], "'0' is not a number of at least 1"),
+        (["--protocol", "priors-file"], "--priors and --protocol priors-file need each other"),
+        (["--priors", "a.txt"], "--priors and --protocol priors-file need each other"),
+        (["--map", "a.ply", "--map", "b.ply"], "2 maps for 1 scenes"),
+        (["--report", "/nowhere/at/all"], "--report /nowhere/at/all: there is no folder /nowhere/at"),
+    ],
+)
+def test_options_that_make_no_sense(tmp_path, wrong, message, capsys):
+    with pytest.raises(SystemExit, match="2"):
+        main([str(tmp_path), *wrong])
+    assert message in capsys.readouterr().err
+
+
+def test_help_names_the_options_of_the_localizer(capsys):
+    with pytest.raises(SystemExit, match="0"):
+        main(["--help"])
+    printed = "".join(capsys.readouterr().out.split())
+    own = ("max_image_width", "seed")  # --max-width and --seed
+    names = [field.name for field in fields(LocalizerOptions) if field.name not in own]
+    assert ",".join(names) in printed
+
+
+# Real photos
+
+
+@pytest.mark.parametrize("method", ["default", "published"])
+def test_command_writes_its_report(shared, tmp_path, capsys, method):
+    path = tmp_path / "report.json"
+    scene = str(shared / "scenes/bonsai")
+    assert (
+        main([scene, "--method", method, "--matcher", "sift", "--limit", "2", "--sigma", "0.3", "--json", str(path)])
+        == 0
+    )
+    report = json.loads(path.read_text())
+    assert list(report) == [
+        "scene",
+        "protocol",
+        "method",
+        "matcher",
+        "sigma",
+        "seed",
+        "options",
+        "without",
+        "spoil",
+        "queries",
+        "success_rate",
+        "rotation_error_deg",
+        "translation_error",
+        "answered",
+        "wrong_answers",
+        "milliseconds",
+        "nees_mean",
+        "nees_median",
+        "coverage",
+        "per_query",
+    ]
+    assert (report["scene"], report["protocol"], report["method"]) == ("bonsai", "paper", method)
+    assert (report["matcher"], report["sigma"], report["seed"], report["queries"]) == ("sift", 0.3, 0, 2)
+    assert report["success_rate"] == 1.0
+    assert report["rotation_error_deg"]["median"] < 1.0
+    assert report["milliseconds"]["median"] > 0
+    printed = capsys.readouterr().out
+    assert "DSCF5565.jpg" in printed
+    assert "100.0 % of 2" in printed
+
+
+def test_command_gives_the_same_answer_to_the_same_seed(shared, tmp_path):
+    reports = []
+    for number, limit in enumerate(("1", "2")):
+        path = tmp_path / f"{number}.json"
+        scene = str(shared / "scenes/lego")
+        main(
+            [scene, "--method", "published", "--matcher", "sift", "--seed", "5", "--limit", limit, "--json", str(path)]
+        )
+        reports.append(json.loads(path.read_text())["per_query"][0])
+        del reports[-1]["milliseconds"]
+        del reports[-1]["stage_milliseconds"]
+    assert reports[0] == reports[1]
+
+
+def test_command_on_a_folder_without_a_scene(tmp_path, capsys):
+    assert main([str(tmp_path)]) == 1
+    assert "transforms.json" in capsys.readouterr().err
+
+
+def test_command_on_a_scene_without_a_map(room_scene, capsys):
+    (room_scene / "map.ply").unlink()
+    assert main([str(room_scene)]) == 1
+    assert "holds no map (map.ply, " in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [["--sigma", "-1"], ["--sigma", "nan"], ["--limit", "x"], ["--max-width", "0"], ["--json", "/nowhere/a.json"]],
+)
+def test_command_refuses_wrong_options_before_it_starts(tmp_path, wrong, capsys):
+    with pytest.raises(SystemExit, match="2"):
+        main([str(tmp_path), *wrong])
+    assert wrong[0] in capsys.readouterr().err

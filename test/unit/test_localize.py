@@ -1,0 +1,174 @@
+"""The pipeline on ray-traced photos of a room whose map was built by other code."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from gsfeatloc_ros.common.camera import Camera
+from gsfeatloc_ros.common.geometry import make_pose, rotation_error_deg, so3_exp, translation_error
+from gsfeatloc_ros.localize.estimate import Status
+from gsfeatloc_ros.localize.localizer import Localizer, LocalizerOptions
+from gsfeatloc_ros.match import create_matcher
+from gsfeatloc_ros.render import create_renderer
+
+
+@pytest.fixture(scope="module")
+def renderer(room_map):
+    return create_renderer(room_map)
+
+
+@pytest.fixture(scope="module", params=["sift", "xfeat"])
+def localizer(renderer, request):
+    return Localizer(renderer, create_matcher(request.param))
+
+
+@pytest.fixture(scope="module")
+def sift_localizer(renderer):
+    return Localizer(renderer, create_matcher("sift"))
+
+
+def test_finds_the_camera_within_a_degree_and_two_centimetres(localizer, room_camera, room_queries) -> None:
+    for query in room_queries[:4]:
+        estimate = localizer.localize(query.image, room_camera, query.T_map_camera_prior)
+        assert estimate.status is Status.LOCALIZED, estimate.reason
+        assert rotation_error_deg(estimate.T_map_camera, query.T_map_camera) < 1.0
+        assert translation_error(estimate.T_map_camera, query.T_map_camera) < 0.02
+
+
+def test_the_answer_carries_its_evidence(sift_localizer, room_camera, room_queries) -> None:
+    query = room_queries[0]
+    estimate = sift_localizer.localize(query.image, room_camera, query.T_map_camera_prior)
+    np.testing.assert_allclose(estimate.covariance, estimate.covariance.T, rtol=1e-6)
+    assert np.linalg.eigvalsh(estimate.covariance)[0] > 0
+    assert 20 <= estimate.inliers <= estimate.matches
+    assert len(estimate.correspondences) == estimate.inliers
+    assert 0 < estimate.reprojection_error < 3.0
+    assert 1 <= estimate.passes <= 4
+    assert 0.5 < estimate.agreement <= 1.0
+    assert 0.5 < estimate.coverage <= 1.0
+    assert {
+        "prepare",
+        "features",
+        "render",
+        "match",
+        "track",
+        "solve",
+        "judge",
+        "total",
+    } <= estimate.milliseconds.keys()
+    stages = sum(ms for stage, ms in estimate.milliseconds.items() if stage != "total")
+    assert stages <= estimate.milliseconds["total"]
+
+
+def test_the_same_seed_gives_the_same_answer(sift_localizer, room_camera, room_queries) -> None:
+    query = room_queries[1]
+    a, b = (sift_localizer.localize(query.image, room_camera, query.T_map_camera_prior) for _ in range(2))
+    np.testing.assert_array_equal(a.T_map_camera, b.T_map_camera)
+
+
+def test_wide_photos_are_resized(renderer, room_camera, room_queries) -> None:
+    narrow = Localizer(renderer, create_matcher("sift"), LocalizerOptions(max_image_width=480))
+    query = room_queries[2]
+    estimate = narrow.localize(query.image, room_camera, query.T_map_camera_prior)
+    assert estimate.last_render.rgb.shape == (360, 480, 3)
+    assert rotation_error_deg(estimate.T_map_camera, query.T_map_camera) < 1.0
+    assert translation_error(estimate.T_map_camera, query.T_map_camera) < 0.03
+
+
+def assert_no_answer(estimate) -> None:
+    assert estimate.status in (Status.FAILED, Status.REJECTED)
+    assert not estimate.localized
+    assert estimate.T_map_camera is None
+    assert estimate.covariance is None
+    assert estimate.reason
+
+
+@pytest.mark.parametrize("value", [0, 128, 255], ids=["black", "grey", "white"])
+def test_a_photo_of_nothing_is_a_failure_with_a_reason(localizer, room_camera, room_queries, value: int) -> None:
+    nothing = np.full((room_camera.height, room_camera.width, 3), value, np.uint8)
+    estimate = localizer.localize(nothing, room_camera, room_queries[0].T_map_camera)
+    assert_no_answer(estimate)
+    assert "0 features" in estimate.reason
+
+
+def test_a_prior_that_sees_nothing_is_a_failure(localizer, room_camera, room_queries) -> None:
+    outside = make_pose(np.eye(3), np.array([0, 0, 1000.0]))
+    assert_no_answer(localizer.localize(room_queries[0].image, room_camera, outside))
+
+
+def test_noise_is_no_place(localizer, room_camera, room_queries) -> None:
+    noise = np.random.default_rng(0).integers(0, 256, room_queries[0].image.shape, dtype=np.uint8)
+    assert_no_answer(localizer.localize(noise, room_camera, room_queries[0].T_map_camera))
+
+
+def test_mirrored_photos_are_rejected(localizer, room_camera, room_queries) -> None:
+    """Seen from behind, through the wall, the room is mirrored: poses there match well, but are far from the prior."""
+    for query in room_queries[:2]:
+        mirrored = np.ascontiguousarray(query.image[:, ::-1])
+        assert_no_answer(localizer.localize(mirrored, room_camera, query.T_map_camera))
+
+
+def test_an_answer_far_from_the_prior_is_rejected(sift_localizer, room_camera, room_queries) -> None:
+    """The prior is 0.3 m and 10 degrees off at least, and says that it knows better."""
+    query = room_queries[0]
+    sure = np.diag([1e-6] * 6)
+    estimate = sift_localizer.localize(query.image, room_camera, query.T_map_camera_prior, sure)
+    assert estimate.status is Status.REJECTED
+    assert "standard deviations from the prior" in estimate.reason
+
+
+def test_the_render_at_the_estimate_is_the_judge(renderer, room_camera, room_queries) -> None:
+    """What it is asked for and does not have is said; the pose is kept back."""
+    query = room_queries[0]
+    demands = {
+        "min_inliers": (100_000, "at least 100000 needed"),
+        "min_inlier_ratio": (1.0, "inliers"),
+        "min_coverage": (1.1, "of the photo"),
+        "min_agreement": (1.1, "correlation"),
+    }
+    for option, (value, says) in demands.items():
+        demanding = Localizer(renderer, create_matcher("sift"), LocalizerOptions(max_views=0, **{option: value}))
+        estimate = demanding.localize(query.image, room_camera, query.T_map_camera_prior)
+        assert estimate.status is Status.REJECTED
+        assert_no_answer(estimate)
+        assert says in estimate.reason
+        assert estimate.passes >= 1
+
+
+def test_distortion_is_taken_out(sift_localizer, room_camera, room_queries) -> None:
+    """Without the distortion coefficients the same photo gives a clearly worse pose, or none."""
+    query = room_queries[0]
+    pinhole = replace(room_camera, distortion=np.zeros(5))
+    good = sift_localizer.localize(query.image, room_camera, query.T_map_camera_prior)
+    bad = sift_localizer.localize(query.image, pinhole, query.T_map_camera_prior)
+    error = translation_error(good.T_map_camera, query.T_map_camera)
+    assert not bad.localized or translation_error(bad.T_map_camera, query.T_map_camera) > 2 * error
+
+
+@pytest.mark.parametrize(
+    "image",
+    [np.zeros((480, 640), np.uint8), np.zeros((480, 641, 3), np.uint8), np.zeros((480, 640, 3), np.float32)],
+    ids=["grey", "other size", "float"],
+)
+def test_refuses_images_of_another_kind(sift_localizer, image) -> None:
+    camera = Camera(640, 480, np.array([[500.0, 0, 320], [0, 500.0, 240], [0, 0, 1]]))
+    with pytest.raises(ValueError, match="expected an RGB image 640x480"):
+        sift_localizer.localize(image, camera, np.eye(4))
+
+
+@pytest.mark.parametrize("prior", [np.full((4, 4), np.nan), np.eye(3)], ids=["NaN", "3x3"])
+def test_refuses_priors_that_are_no_pose(sift_localizer, room_camera, room_queries, prior) -> None:
+    with pytest.raises(ValueError, match="prior"):
+        sift_localizer.localize(room_queries[0].image, room_camera, prior)
+
+
+def test_a_perfect_prior_is_confirmed(sift_localizer, room_camera, room_queries) -> None:
+    query = room_queries[3]
+    estimate = sift_localizer.localize(
+        query.image, room_camera, query.T_map_camera @ make_pose(so3_exp(np.zeros(3)), [0, 0, 0])
+    )
+    assert estimate.localized
+    assert translation_error(estimate.T_map_camera, query.T_map_camera) < 0.02
