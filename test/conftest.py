@@ -12,7 +12,7 @@ import pytest
 from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.maps.gaussian_map import GaussianMap
 from gsfeatloc_ros.maps.ply import write_ply
-from gsfeatloc_ros.simulate import Query, Room, cover, simulate_queries
+from gsfeatloc_ros.simulate import Room, SimulatedPhoto, cover, simulate_photos
 
 # Nodes of another run on this machine, or of a robot on its network, must not be heard.
 os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
@@ -54,8 +54,8 @@ def room_camera() -> Camera:
 
 
 @pytest.fixture(scope="session")
-def room_queries(room: Room, room_camera: Camera) -> list[Query]:
-    return simulate_queries(room, room_camera, count=8, seed=0)
+def room_photos(room: Room, room_camera: Camera) -> list[SimulatedPhoto]:
+    return simulate_photos(room, room_camera, count=8, seed=0)
 
 
 @pytest.fixture(scope="session")
@@ -68,8 +68,8 @@ def shared() -> Path:
 
 
 @pytest.fixture
-def query(room_queries: list[Query]) -> Query:
-    return room_queries[0]
+def photo(room_photos: list[SimulatedPhoto]) -> SimulatedPhoto:
+    return room_photos[0]
 
 
 # What talks to ROS is imported in here: see pytest_configure.

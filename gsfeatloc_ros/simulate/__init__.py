@@ -1,8 +1,8 @@
 """A simulated room: its photos, its Gaussian Splatting map and its bag, for the demo and the tests."""
 
 from gsfeatloc_ros.simulate.bag import write_bag
-from gsfeatloc_ros.simulate.photos import Query, simulate_queries
+from gsfeatloc_ros.simulate.photos import SimulatedPhoto, simulate_photos
 from gsfeatloc_ros.simulate.room import Room, Trace
 from gsfeatloc_ros.simulate.splat import cover
 
-__all__ = ["Query", "Room", "Trace", "cover", "simulate_queries", "write_bag"]
+__all__ = ["Room", "SimulatedPhoto", "Trace", "cover", "simulate_photos", "write_bag"]

@@ -1,4 +1,4 @@
-"""Write queries as a rosbag2, as a robot would have recorded them."""
+"""Write simulated photos as a rosbag2, as a robot would have recorded them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.geometry import quaternion_from_matrix
-from gsfeatloc_ros.simulate.photos import Query
+from gsfeatloc_ros.simulate.photos import SimulatedPhoto
 
 IMAGE_TOPIC = "/camera/image_raw"
 CAMERA_INFO_TOPIC = "/camera/camera_info"
@@ -27,11 +27,11 @@ def nanoseconds(stamp: float) -> int:
 
 
 def write_bag(
-    path: str | Path, camera: Camera, queries: Sequence[Query], storage: StoragePlugin = StoragePlugin.MCAP
+    path: str | Path, camera: Camera, photos: Sequence[SimulatedPhoto], storage: StoragePlugin = StoragePlugin.MCAP
 ) -> None:
-    """Write a new rosbag2 folder: of each query its prior, camera info and image, and the true pose.
+    """Write a new rosbag2 folder: of each photo its prior, camera info and image, and the true pose.
 
-    All four carry the query's stamp; images are rgb8, poses PoseStamped in the frame `map`.
+    All four carry the stamp of the photo; images are rgb8, poses PoseStamped in the frame `map`.
 
     Raises:
         rosbags.rosbag2.WriterError: the path exists.
@@ -46,16 +46,16 @@ def write_bag(
                 (TRUTH_TOPIC, "geometry_msgs/msg/PoseStamped"),
             )
         }
-        for query in queries:
+        for photo in photos:
             messages = {
-                PRIOR_TOPIC: _pose(query.stamp, query.T_map_camera_prior),
-                CAMERA_INFO_TOPIC: _camera_info(query.stamp, camera),
-                IMAGE_TOPIC: _image(query.stamp, query.image),
-                TRUTH_TOPIC: _pose(query.stamp, query.T_map_camera),
+                PRIOR_TOPIC: _pose(photo.stamp, photo.T_map_camera_prior),
+                CAMERA_INFO_TOPIC: _camera_info(photo.stamp, camera),
+                IMAGE_TOPIC: _image(photo.stamp, photo.image),
+                TRUTH_TOPIC: _pose(photo.stamp, photo.T_map_camera),
             }
             for topic, message in messages.items():
                 cdr = _TYPES.serialize_cdr(message, message.__msgtype__)
-                writer.write(connections[topic], nanoseconds(query.stamp), cdr)
+                writer.write(connections[topic], nanoseconds(photo.stamp), cdr)
 
 
 def _header(stamp: float, frame: str) -> object:

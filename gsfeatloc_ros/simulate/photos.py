@@ -23,7 +23,7 @@ _START = 100.0
 
 
 @dataclass(frozen=True, eq=False)
-class Query:
+class SimulatedPhoto:
     """A photo with its truth and its prior.
 
     Attributes:
@@ -58,7 +58,7 @@ class Walk:
         return make_pose(rotation, position)
 
 
-def simulate_queries(room: Room, camera: Camera, count: int, seed: int = 0) -> list[Query]:
+def simulate_photos(room: Room, camera: Camera, count: int, seed: int = 0) -> list[SimulatedPhoto]:
     """Carry `camera` through the room and take `count` photos, one a second, each with a prior.
 
     Priors are off by PRIOR_ROTATION_DEG about, and by PRIOR_TRANSLATION along, random directions, in free space.
@@ -66,16 +66,16 @@ def simulate_queries(room: Room, camera: Camera, count: int, seed: int = 0) -> l
     rng = np.random.default_rng(seed)
     walk = Walk(rng.uniform(0, 2 * np.pi, 4))
     room_camera = RoomCamera(room, camera)
-    queries = []
+    photos = []
     for index in tqdm(range(count), desc="photos", unit="photo", leave=False, disable=None):
         stamp = _START + index * _INTERVAL
         pose = walk.pose(stamp)
-        queries.append(Query(stamp, room_camera.photo(walk.pose, stamp, rng), pose, perturbed(room, pose, rng)))
-    return queries
+        photos.append(SimulatedPhoto(stamp, room_camera.photo(walk.pose, stamp, rng), pose, perturbed(room, pose, rng)))
+    return photos
 
 
 def perturbed(room: Room, pose: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """A prior for the camera pose (4, 4): off at random as a Query's, and CLEARANCE away from every surface."""
+    """Return a prior for the camera pose (4, 4): off at random as in simulate_photos, CLEARANCE away from surfaces."""
     angle = np.radians(rng.uniform(*PRIOR_ROTATION_DEG))
     rotation = pose[:3, :3] @ so3_exp(angle * random_unit_vector(rng))
     while True:

@@ -31,7 +31,7 @@ from gsfeatloc_ros.maps.gaussian_map import GaussianMap
 from gsfeatloc_ros.maps.ply import write_ply
 from gsfeatloc_ros.match import DEFAULT_MATCHER, MATCHERS
 from gsfeatloc_ros.render import Renderer, create_renderer
-from gsfeatloc_ros.simulate import Query, Room, cover, simulate_queries, write_bag
+from gsfeatloc_ros.simulate import Room, SimulatedPhoto, cover, simulate_photos, write_bag
 from gsfeatloc_ros.simulate.bag import CAMERA_INFO_TOPIC, IMAGE_TOPIC, PRIOR_TOPIC
 
 MAX_ROTATION_ERROR_DEG = 1.0
@@ -55,7 +55,7 @@ class Result:
         prior_error, error: degrees and metres; `error` is NaN without an answer.
     """
 
-    query: Query
+    photo: SimulatedPhoto
     answer: Answer
     prior_error: tuple[float, float]
     error: tuple[float, float]
@@ -65,11 +65,11 @@ class Result:
         return self.error[0] <= MAX_ROTATION_ERROR_DEG and self.error[1] <= MAX_TRANSLATION_ERROR
 
     @staticmethod
-    def of(query: Query, answer: Answer) -> Result:
+    def of(photo: SimulatedPhoto, answer: Answer) -> Result:
         error = (float("nan"), float("nan"))
         if answer.T_map_camera is not None:
-            error = _pose_error(query.T_map_camera, answer.T_map_camera)
-        return Result(query, answer, _pose_error(query.T_map_camera, query.T_map_camera_prior), error)
+            error = _pose_error(photo.T_map_camera, answer.T_map_camera)
+        return Result(photo, answer, _pose_error(photo.T_map_camera, photo.T_map_camera_prior), error)
 
     def row(self, number: int) -> str:
         """A line of the table."""
@@ -98,10 +98,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     map_file, bag, log = args.out / "room.ply", args.out / "bag", args.out / "localizer.log"
     write_ply(map_file, room_map)
     print(f"map: {len(room_map)} Gaussians cover the room, in {map_file}", flush=True)
-    queries = simulate_queries(room, _CAMERA, args.queries)
+    photos = simulate_photos(room, _CAMERA, args.queries)
     shutil.rmtree(bag, ignore_errors=True)
-    write_bag(bag, _CAMERA, queries)
-    print(f"bag: {len(queries)} photos with priors, in {bag}", flush=True)
+    write_bag(bag, _CAMERA, photos)
+    print(f"bag: {len(photos)} photos with priors, in {bag}", flush=True)
 
     _isolate_ros()
     results = []
@@ -111,8 +111,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             print("photo         prior error          final error   inliers      ms", flush=True)
             topics = Topics(IMAGE_TOPIC, CAMERA_INFO_TOPIC, PRIOR_TOPIC)
             answers = play_bag(bag, topics, is_running=lambda: process.poll() is None)
-            for number, (query, answer) in enumerate(zip(queries, answers, strict=True), start=1):
-                results.append(Result.of(query, answer))
+            for number, (photo, answer) in enumerate(zip(photos, answers, strict=True), start=1):
+                results.append(Result.of(photo, answer))
                 print(results[-1].row(number), flush=True)
     except (RuntimeError, TimeoutError) as error:
         print(f"demo: {error}; see {log}", file=sys.stderr)
@@ -186,18 +186,18 @@ def draw_results(results: Sequence[Result], room_map: GaussianMap) -> np.ndarray
 
 
 def _draw_result(number: int, result: Result, renderer: Renderer) -> np.ndarray:
-    query, pose = result.query, result.answer.T_map_camera
+    photo, pose = result.photo, result.answer.T_map_camera
     # Renders are of a pinhole camera: without its distortion the photo can be compared with them.
-    photo = _CAMERA.undistort_image(query.image)
-    at_prior = renderer.render(_CAMERA, query.T_map_camera_prior).image()
+    undistorted = _CAMERA.undistort_image(photo.image)
+    at_prior = renderer.render(_CAMERA, photo.T_map_camera_prior).image()
     if pose is None:
-        at_estimate, words = np.zeros_like(photo), "no answer"
+        at_estimate, words = np.zeros_like(undistorted), "no answer"
     else:
         at_estimate = renderer.render(_CAMERA, pose).image()
         words = f"render at the estimate: {result.error[0]:.2f} deg, {100 * result.error[1]:.1f} cm off"
     prior_words = f"render at the prior: {result.prior_error[0]:.0f} deg, {result.prior_error[1]:.2f} m off"
     panels = [
-        _captioned(photo, f"photo {number} (undistorted)"),
+        _captioned(undistorted, f"photo {number} (undistorted)"),
         _captioned(at_prior, prior_words),
         _captioned(at_estimate, words),
     ]

@@ -145,11 +145,11 @@ def test_median_depth_ignores_a_floater_that_drags_the_mean(gsplat) -> None:
     assert render.depth[middle] < 3.2
 
 
-def test_median_depth_is_close_to_the_exact_one(gsplat, room_map, room_queries) -> None:
-    query = room_queries[0]
+def test_median_depth_is_close_to_the_exact_one(gsplat, room_map, room_photos) -> None:
+    photo = room_photos[0]
     camera = replace(small_camera(120, 90), K=np.array([[94.0, 0, 59.5], [0, 94.0, 44.5], [0, 0, 1]]))
-    estimate = on_stand_in(room_map).render(camera, query.T_map_camera).on_host()
-    exact = CpuRenderer(room_map).render(camera, query.T_map_camera)
+    estimate = on_stand_in(room_map).render(camera, photo.T_map_camera).on_host()
+    exact = CpuRenderer(room_map).render(camera, photo.T_map_camera)
     covered = exact.alpha > 0.8
     assert covered.mean() > 0.5
     error = np.abs(estimate.median_depth - exact.median_depth)[covered] / exact.median_depth[covered]
@@ -353,10 +353,10 @@ def test_gsplat_draws_the_picture_that_the_reference_draws(sh_degree: int, antia
 
 
 @on_gpu
-def test_gsplat_draws_the_same_each_time(room_map, room_camera, room_queries) -> None:
+def test_gsplat_draws_the_same_each_time(room_map, room_camera, room_photos) -> None:
     renderer = create_renderer(room_map, "auto")
     assert isinstance(renderer, GpuRenderer)
-    a, b = (renderer.render(room_camera, room_queries[0].T_map_camera).on_host() for _ in range(2))
+    a, b = (renderer.render(room_camera, room_photos[0].T_map_camera).on_host() for _ in range(2))
     for name in ("rgb", "depth", "median_depth", "depth_std", "alpha"):
         np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
 
@@ -369,8 +369,8 @@ def test_gsplat_draws_nothing_where_there_is_nothing(gaussian_map) -> None:
 
 
 @on_gpu
-def test_gsplat_sees_the_room_as_the_cpu_does(room_map, room_camera, room_queries) -> None:
-    pose = room_queries[0].T_map_camera
+def test_gsplat_sees_the_room_as_the_cpu_does(room_map, room_camera, room_photos) -> None:
+    pose = room_photos[0].T_map_camera
     gpu = create_renderer(room_map, "cuda").render(room_camera, pose).on_host()
     cpu = create_renderer(room_map, "cpu").render(room_camera, pose)
     assert_same(gpu, cpu, 60)

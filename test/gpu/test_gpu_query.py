@@ -51,23 +51,23 @@ def renderer(room_map) -> OnGpu:
 
 
 @pytest.mark.parametrize("name", ["sift", "xfeat", "xfeat-lighterglue"])
-def test_finds_the_camera_as_on_the_cpu(gpu, renderer, room_map, room_camera, room_queries, name) -> None:
+def test_finds_the_camera_as_on_the_cpu(gpu, renderer, room_map, room_camera, room_photos, name) -> None:
     on_gpu = Localizer(renderer, MATCHERS[name]("", 2048, gpu.device))
     on_cpu = Localizer(CpuRenderer(room_map), create_matcher(name, device="cpu"))
-    for query in room_queries[:3]:
+    for photo in room_photos[:3]:
         there, here = (
-            localizer.localize(query.image, room_camera, query.T_map_camera_prior) for localizer in (on_gpu, on_cpu)
+            localizer.localize(photo.image, room_camera, photo.T_map_camera_prior) for localizer in (on_gpu, on_cpu)
         )
         assert there.status is here.status is Status.LOCALIZED
         assert rotation_error_deg(there.T_map_camera, here.T_map_camera) < 0.1
         assert translation_error(there.T_map_camera, here.T_map_camera) < 0.005
         assert there.inliers == pytest.approx(here.inliers, rel=0.1)
-        np.testing.assert_array_equal(there.last_render.image().shape, query.image.shape)
+        np.testing.assert_array_equal(there.last_render.image().shape, photo.image.shape)
 
 
 @pytest.mark.parametrize("name", ["sift", "xfeat", "aliked-lightglue", "disk-lightglue"])
 def test_no_picture_leaves_the_gpu_before_the_pose_is_solved(
-    gpu, renderer, room_camera, room_queries, name, monkeypatch
+    gpu, renderer, room_camera, room_photos, name, monkeypatch
 ) -> None:
     localizer = Localizer(renderer, MATCHERS[name]("", 2048, gpu.device))
     left = []
@@ -78,11 +78,11 @@ def test_no_picture_leaves_the_gpu_before_the_pose_is_solved(
         return judge(*arguments)
 
     monkeypatch.setattr(localizer, "_judge", note_what_left_until_now)
-    query = room_queries[0]
-    image = query.image.copy()
+    photo = room_photos[0]
+    image = photo.image.copy()
     image.flags.writeable = False  # as those of messages
     gpu.reset()
-    estimate = localizer.localize(image, room_camera, query.T_map_camera_prior)
+    estimate = localizer.localize(image, room_camera, photo.T_map_camera_prior)
     assert estimate.status is Status.LOCALIZED
     assert 0 < max(left) <= SMALL
     # The photo's corners; of the render at the prior and of those at estimates, matches and the depths under them.
@@ -91,28 +91,28 @@ def test_no_picture_leaves_the_gpu_before_the_pose_is_solved(
     assert max(gpu.to_host) > SMALL
 
 
-def test_a_matcher_on_the_cpu_takes_renders_of_a_gpu(gpu, renderer, room_camera, room_queries) -> None:
-    query = room_queries[0]
+def test_a_matcher_on_the_cpu_takes_renders_of_a_gpu(gpu, renderer, room_camera, room_photos) -> None:
+    photo = room_photos[0]
     estimate = Localizer(renderer, create_matcher("sift", device="cpu")).localize(
-        query.image, room_camera, query.T_map_camera_prior
+        photo.image, room_camera, photo.T_map_camera_prior
     )
     assert estimate.status is Status.LOCALIZED
-    assert translation_error(estimate.T_map_camera, query.T_map_camera) < 0.02
+    assert translation_error(estimate.T_map_camera, photo.T_map_camera) < 0.02
 
 
-def test_a_dark_photo_has_no_answer(gpu, renderer, room_camera, room_queries) -> None:
-    query = room_queries[0]
+def test_a_dark_photo_has_no_answer(gpu, renderer, room_camera, room_photos) -> None:
+    photo = room_photos[0]
     estimate = Localizer(renderer, MATCHERS["sift"]("", 2048, gpu.device)).localize(
-        np.zeros_like(query.image), room_camera, query.T_map_camera_prior
+        np.zeros_like(photo.image), room_camera, photo.T_map_camera_prior
     )
     assert estimate.status is Status.FAILED
     assert "0 features in the photo" in estimate.reason
 
 
-def test_a_render_of_nothing_has_no_answer(gpu, room_map, room_camera, room_queries) -> None:
-    query = room_queries[0]
+def test_a_render_of_nothing_has_no_answer(gpu, room_map, room_camera, room_photos) -> None:
+    photo = room_photos[0]
     nothing = OnGpu(replace(room_map, means=room_map.means + np.float32([0, 0, 1e4])))
     estimate = Localizer(nothing, MATCHERS["sift"]("", 2048, gpu.device)).localize(
-        query.image, room_camera, query.T_map_camera_prior
+        photo.image, room_camera, photo.T_map_camera_prior
     )
     assert estimate.status is Status.FAILED

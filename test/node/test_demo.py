@@ -28,16 +28,16 @@ def test_demo_localizes_photos_of_a_bag(tmp_path):
     assert "ready" in (tmp_path / "localizer.log").read_text()
 
 
-def answer_to(query, T_map_camera, **evidence) -> Answer:
+def answer_to(photo, T_map_camera, **evidence) -> Answer:
     return Answer("100.000000000", T_map_camera, evidence, 250.0)
 
 
-def test_failures_and_wrong_answers_are_not_successes(room_queries):
-    query = room_queries[0]
-    good = Result.of(query, answer_to(query, query.T_map_camera, inliers="99"))
-    wrong = Result.of(query, answer_to(query, query.T_map_camera_prior, inliers="21"))
-    refused = Result.of(query, answer_to(query, None, reason="7 inliers between the photo and the render"))
-    silent = Result.of(query, Answer("100.000000000", None, {}, float("nan")))
+def test_failures_and_wrong_answers_are_not_successes(room_photos):
+    photo = room_photos[0]
+    good = Result.of(photo, answer_to(photo, photo.T_map_camera, inliers="99"))
+    wrong = Result.of(photo, answer_to(photo, photo.T_map_camera_prior, inliers="21"))
+    refused = Result.of(photo, answer_to(photo, None, reason="7 inliers between the photo and the render"))
+    silent = Result.of(photo, Answer("100.000000000", None, {}, float("nan")))
     assert [result.success for result in (good, wrong, refused, silent)] == [True, False, False, False]
     assert "0.000 deg   0.00 cm        99     250" in good.row(1)
     assert refused.row(3).endswith("no answer: 7 inliers between the photo and the render")
@@ -49,8 +49,8 @@ def test_failures_and_wrong_answers_are_not_successes(room_queries):
 
 
 @pytest.fixture
-def bag(tmp_path, room_camera, room_queries):
-    write_bag(tmp_path / "bag", room_camera, room_queries[:1])
+def bag(tmp_path, room_camera, room_photos):
+    write_bag(tmp_path / "bag", room_camera, room_photos[:1])
     return tmp_path / "bag"
 
 
@@ -74,7 +74,7 @@ def test_localizer_is_gone_after_the_demo_even_when_it_is_interrupted(room_map_f
     assert process.poll() is not None
 
 
-def test_no_answer_leaves_the_error_unknown(room_queries):
-    result = Result.of(room_queries[0], answer_to(room_queries[0], None))
+def test_no_answer_leaves_the_error_unknown(room_photos):
+    result = Result.of(room_photos[0], answer_to(room_photos[0], None))
     assert np.isnan(result.error).all()
     assert result.prior_error[0] > 1

@@ -14,9 +14,9 @@ from node_harness import (
 )
 
 
-def test_image_and_prior_give_the_pose(client, room_camera, query):
-    send_inputs(client, room_camera, query)
-    image = rgb_image(query.image)
+def test_image_and_prior_give_the_pose(client, room_camera, photo):
+    send_inputs(client, room_camera, photo)
+    image = rgb_image(photo.image)
     diagnostic = client.attempt(image)
     assert diagnostic.ok, diagnostic
     assert diagnostic.values["status"] == "localized"
@@ -25,7 +25,7 @@ def test_image_and_prior_give_the_pose(client, room_camera, query):
     pose = client.pose_of(image)
     assert pose.header.frame_id == "map"
     assert pose.header.stamp == image.header.stamp
-    assert_close(pose, query.T_map_camera)
+    assert_close(pose, photo.T_map_camera)
     covariance = np.reshape(pose.pose.covariance, (6, 6))
     assert np.allclose(covariance, covariance.T)
     assert (np.linalg.eigvalsh(covariance) > 0).all()
@@ -33,18 +33,18 @@ def test_image_and_prior_give_the_pose(client, room_camera, query):
     assert np.sqrt(np.diag(covariance)).max() < 0.1
 
 
-def test_late_subscriber_gets_the_last_pose(client, room_camera, query):
-    send_inputs(client, room_camera, query)
-    image = rgb_image(query.image)
+def test_late_subscriber_gets_the_last_pose(client, room_camera, photo):
+    send_inputs(client, room_camera, photo)
+    image = rgb_image(photo.image)
     assert client.attempt(image).ok
     with connected_client() as late:
         assert late.pose_of(image) is not None
 
 
-def test_rendered_image_is_the_map_seen_from_the_estimate(client, room, room_camera, query):
+def test_rendered_image_is_the_map_seen_from_the_estimate(client, room, room_camera, photo):
     client.listen_to_renders()
-    send_inputs(client, room_camera, query)
-    image = rgb_image(query.image)
+    send_inputs(client, room_camera, photo)
+    image = rgb_image(photo.image)
     assert client.attempt(image).ok
     assert client.spin_until(lambda: any(text(render) == text(image) for render in client.renders))
     render = next(render for render in client.renders if text(render) == text(image))
@@ -52,23 +52,23 @@ def test_rendered_image_is_the_map_seen_from_the_estimate(client, room, room_cam
     rendered = np.frombuffer(render.data, np.uint8).reshape(render.height, render.width, 3) / 255.0
     # The room as a pinhole camera at the true pose would see it.
     pinhole = replace(room_camera.scaled(render.width, render.height), distortion=np.zeros(0))
-    seen = room.trace(pinhole, query.T_map_camera).rgb
+    seen = room.trace(pinhole, photo.T_map_camera).rgb
     assert np.corrcoef(rendered.ravel(), seen.ravel())[0, 1] > 0.9
 
 
-def test_service_localizes_the_newest_image(client, room_camera, query):
-    send_inputs(client, room_camera, query)
-    image = rgb_image(query.image)
+def test_service_localizes_the_newest_image(client, room_camera, photo):
+    send_inputs(client, room_camera, photo)
+    image = rgb_image(photo.image)
     assert client.attempt(image).ok
     client.poses.clear()
     answer = client.relocalize()
     assert answer.success, answer.message
-    assert_close(client.pose_of(image), query.T_map_camera)
+    assert_close(client.pose_of(image), photo.T_map_camera)
 
 
-def test_service_tells_of_failure(client, room_camera, query):
-    send_inputs(client, room_camera, query)
-    image = rgb_image(np.zeros_like(query.image))
+def test_service_tells_of_failure(client, room_camera, photo):
+    send_inputs(client, room_camera, photo)
+    image = rgb_image(np.zeros_like(photo.image))
     assert not client.attempt(image).ok
     answer = client.relocalize()
     assert not answer.success
@@ -76,23 +76,23 @@ def test_service_tells_of_failure(client, room_camera, query):
     assert client.pose_of(image) is None
 
 
-def test_requests_at_once_are_all_answered(client, room_camera, query):
-    send_inputs(client, room_camera, query)
-    assert client.attempt(rgb_image(query.image)).ok
+def test_requests_at_once_are_all_answered(client, room_camera, photo):
+    send_inputs(client, room_camera, photo)
+    assert client.attempt(rgb_image(photo.image)).ok
     answers = client.relocalize_together(8)
     assert all(answer.success for answer in answers)
 
 
-def test_newest_image_wins_and_every_one_is_accounted_for(client, room_camera, query):
-    send_inputs(client, room_camera, query)
-    before = client.attempt(rgb_image(query.image)).values
+def test_newest_image_wins_and_every_one_is_accounted_for(client, room_camera, photo):
+    send_inputs(client, room_camera, photo)
+    before = client.attempt(rgb_image(photo.image)).values
     seen = len(client.diagnostics)
     for _ in range(30):
-        image = rgb_image(query.image)
+        image = rgb_image(photo.image)
         image.header.stamp = client.next_stamp()
         client.send_image(image)
         client.spin(0.02)
-    last = client.attempt(rgb_image(query.image))
+    last = client.attempt(rgb_image(photo.image))
     assert last.ok
     client.spin(1.0)
     attempts = client.diagnostics[seen:]

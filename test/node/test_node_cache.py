@@ -18,14 +18,14 @@ def cache_of(map_path: Path) -> Path:
     return map_path.with_name(map_path.name + ".gsfeatloc-cache")
 
 
-def test_answers_from_the_cache_are_the_same(map_file, room_camera, room_queries):
-    query = room_queries[0]
+def test_answers_from_the_cache_are_the_same(map_file, room_camera, room_photos):
+    photo = room_photos[0]
     poses = []
     for _ in range(2):
         with running_localizer(map__path=map_file, matcher__name="sift"), connected_client() as client:
             client.send_camera_info(info_of(room_camera))
-            client.send_prior(prior_of(query.T_map_camera_prior))
-            message = rgb_image(query.image)
+            client.send_prior(prior_of(photo.T_map_camera_prior))
+            message = rgb_image(photo.image)
             answer = client.attempt(message)
             assert answer.ok, answer.reason
             poses.append(client.pose_of(message).pose.pose)

@@ -16,29 +16,29 @@ from node_harness import (
 from rosgraph_msgs.msg import Clock
 
 
-def test_clock_jumps_back(room_map_file, room_camera, room_queries):
-    query = room_queries[0]
+def test_clock_jumps_back(room_map_file, room_camera, room_photos):
+    photo = room_photos[0]
     parameters = {"map__path": room_map_file, "matcher__name": "sift", "use_sim_time": "true"}
     with running_localizer(**parameters) as localizer, connected_client() as client:
-        prior = prior_of(query.T_map_camera_prior)
+        prior = prior_of(photo.T_map_camera_prior)
         client.publish("/clock", Clock(clock=Time(sec=1000)))
         client.send_camera_info(info_of(room_camera))
         client.send_prior(stamped(prior, 1000))
-        assert_answer(client, query, 1001)
+        assert_answer(client, photo, 1001)
         client.publish("/clock", Clock(clock=Time(sec=900)))
         localizer.wait_for_output(r"time went back by 100\.0 s: what is stamped later is forgotten")
-        assert_no_answer(client, query, "time went back: no prior yet: publish .* on /prior", 901)
-        client.send_image(stamped(rgb_image(query.image), 902))
+        assert_no_answer(client, photo, "time went back: no prior yet: publish .* on /prior", 901)
+        client.send_image(stamped(rgb_image(photo.image), 902))
         client.spin(0.2)
         assert "time went back: no prior yet" in client.relocalize().message
         client.send_prior(stamped(prior, 900))
-        assert_answer(client, query, 903)
+        assert_answer(client, photo, 903)
         # What was still on its way.
         client.send_prior(stamped(prior, 1000))
-        assert_no_answer(client, query, r"prior is 96\.0 s newer than the image .*prior_max_age", 904)
+        assert_no_answer(client, photo, r"prior is 96\.0 s newer than the image .*prior_max_age", 904)
         client.publish("/clock", Clock(clock=Time(sec=0)))
         localizer.wait_for_output(r"time went back by 900\.0 s")
-        assert_no_answer(client, query, "time went back: no prior yet", 1)
+        assert_no_answer(client, photo, "time went back: no prior yet", 1)
         client.send_prior(stamped(prior, 1))
-        assert_answer(client, query, 2)
+        assert_answer(client, photo, 2)
         assert "Traceback" not in localizer.output

@@ -27,8 +27,8 @@ class OutOfMemoryOnce:
         return self._renderer.render(*arguments)
 
 
-def test_unforeseen_exception_is_reported_and_survived(room_map_file, room_camera, room_queries):
-    query = room_queries[0]
+def test_unforeseen_exception_is_reported_and_survived(room_map_file, room_camera, room_photos):
+    photo = room_photos[0]
     rclpy.init(args=node_arguments(map__path=room_map_file, matcher__name="sift"))
     node = LocalizerNode()
     assert node.trigger_configure() == TransitionCallbackReturn.SUCCESS
@@ -40,15 +40,15 @@ def test_unforeseen_exception_is_reported_and_survived(room_map_file, room_camer
     try:
         with connected_client() as client:
             client.send_camera_info(info_of(room_camera))
-            client.send_prior(prior_of(query.T_map_camera_prior))
-            image = rgb_image(query.image)
+            client.send_prior(prior_of(photo.T_map_camera_prior))
+            image = rgb_image(photo.image)
             diagnostic = client.attempt(image)
             assert diagnostic.values["status"] == "error"
             assert diagnostic.reason == "MemoryError: Unable to allocate 3 TiB"
             assert client.pose_of(image) is None
-            image = rgb_image(query.image)
+            image = rgb_image(photo.image)
             assert client.attempt(image).ok
-            assert_close(client.pose_of(image), query.T_map_camera)
+            assert_close(client.pose_of(image), photo.T_map_camera)
     finally:
         assert node.session.stop(10.0)
         rclpy.shutdown()

@@ -20,8 +20,8 @@ from sensor_msgs.msg import CameraInfo, Image
 
 
 @pytest.fixture
-def good_prior(query):
-    return prior_of(query.T_map_camera_prior)
+def good_prior(photo):
+    return prior_of(photo.T_map_camera_prior)
 
 
 @pytest.fixture
@@ -44,26 +44,26 @@ def assert_no_answer(client: Client, localizer, image: Image, says: str) -> None
     assert client.pose_of(image) is None
 
 
-def test_no_prior_yet(room_map_file, good_info, good_prior, query):
+def test_no_prior_yet(room_map_file, good_info, good_prior, photo):
     with (
         running_localizer(map__path=room_map_file, matcher__name="sift") as localizer,
         connected_client() as client,
     ):
         client.send_camera_info(good_info)
-        assert_no_answer(client, localizer, rgb_image(query.image), "no prior yet: publish .* on /prior")
+        assert_no_answer(client, localizer, rgb_image(photo.image), "no prior yet: publish .* on /prior")
         client.send_prior(good_prior)
-        assert_answer(client, query)
+        assert_answer(client, photo)
 
 
-def test_no_camera_info_yet(room_map_file, good_info, good_prior, query):
+def test_no_camera_info_yet(room_map_file, good_info, good_prior, photo):
     with (
         running_localizer(map__path=room_map_file, matcher__name="sift") as localizer,
         connected_client() as client,
     ):
         client.send_prior(good_prior)
-        assert_no_answer(client, localizer, rgb_image(query.image), "no camera_info yet: publish .* on /camera_info")
+        assert_no_answer(client, localizer, rgb_image(photo.image), "no camera_info yet: publish .* on /camera_info")
         client.send_camera_info(good_info)
-        assert_answer(client, query)
+        assert_answer(client, photo)
 
 
 def nan_prior(prior):
@@ -90,21 +90,21 @@ def nowhere_prior(prior):
         (nowhere_prior, "prior is in frame '': name the frame"),
     ],
 )
-def test_prior_that_cannot_be_used(client, localizer, good_info, good_prior, query, spoil, says):
+def test_prior_that_cannot_be_used(client, localizer, good_info, good_prior, photo, spoil, says):
     send_good_inputs(client, good_info, good_prior)
-    bad = spoil(prior_of(query.T_map_camera_prior))
+    bad = spoil(prior_of(photo.T_map_camera_prior))
     assert client.until_refused(lambda: client.send_prior(bad), says)
-    assert_no_answer(client, localizer, rgb_image(query.image), says)
+    assert_no_answer(client, localizer, rgb_image(photo.image), says)
     client.send_prior(good_prior)
-    assert_answer(client, query)
+    assert_answer(client, photo)
 
 
-def test_prior_in_a_frame_that_nobody_knows(client, localizer, good_info, good_prior, query):
+def test_prior_in_a_frame_that_nobody_knows(client, localizer, good_info, good_prior, photo):
     client.send_camera_info(good_info)
-    client.send_prior(prior_of(query.T_map_camera_prior, "odom"))
-    assert_no_answer(client, localizer, rgb_image(query.image), "prior is in frame 'odom' but the map is in 'map': tf")
+    client.send_prior(prior_of(photo.T_map_camera_prior, "odom"))
+    assert_no_answer(client, localizer, rgb_image(photo.image), "prior is in frame 'odom' but the map is in 'map': tf")
     client.send_prior(good_prior)
-    assert_answer(client, query)
+    assert_answer(client, photo)
 
 
 @pytest.mark.parametrize(
@@ -114,23 +114,23 @@ def test_prior_in_a_frame_that_nobody_knows(client, localizer, good_info, good_p
         ({"distortion_model": "thin_prism"}, "distortion model 'thin_prism' is not one of"),
     ],
 )
-def test_camera_info_that_cannot_be_used(client, localizer, room_camera, good_info, good_prior, query, changes, says):
+def test_camera_info_that_cannot_be_used(client, localizer, room_camera, good_info, good_prior, photo, changes, says):
     send_good_inputs(client, good_info, good_prior)
     bad = info_of(room_camera)
     for name, value in changes.items():
         setattr(bad, name, value)
     assert client.until_refused(lambda: client.send_camera_info(bad), says)
-    assert_no_answer(client, localizer, rgb_image(query.image), says)
+    assert_no_answer(client, localizer, rgb_image(photo.image), says)
     client.send_camera_info(good_info)
-    assert_answer(client, query)
+    assert_answer(client, photo)
 
 
-def test_camera_info_of_another_size(client, localizer, room_camera, good_info, good_prior, query):
+def test_camera_info_of_another_size(client, localizer, room_camera, good_info, good_prior, photo):
     bad: CameraInfo = info_of(room_camera.scaled(320, 240))
     send_good_inputs(client, bad, good_prior)
-    assert_no_answer(client, localizer, rgb_image(query.image), "camera_info is for 320x240 but the image is 640x480")
+    assert_no_answer(client, localizer, rgb_image(photo.image), "camera_info is for 320x240 but the image is 640x480")
     client.send_camera_info(good_info)
-    assert_answer(client, query)
+    assert_answer(client, photo)
 
 
 def of_unknown_encoding(image):
@@ -157,24 +157,24 @@ def of_no_size(image):
         (of_no_size, "image size 0x0"),
     ],
 )
-def test_image_that_cannot_be_decoded(client, localizer, good_info, good_prior, query, spoil, says):
+def test_image_that_cannot_be_decoded(client, localizer, good_info, good_prior, photo, spoil, says):
     send_good_inputs(client, good_info, good_prior)
-    assert_no_answer(client, localizer, spoil(rgb_image(query.image)), says)
+    assert_no_answer(client, localizer, spoil(rgb_image(photo.image)), says)
     assert not client.relocalize().success
-    assert_answer(client, query)
+    assert_answer(client, photo)
 
 
-def test_image_of_nothing(client, localizer, good_info, good_prior, query):
+def test_image_of_nothing(client, localizer, good_info, good_prior, photo):
     send_good_inputs(client, good_info, good_prior)
-    assert_no_answer(client, localizer, rgb_image(np.zeros_like(query.image)), "0 features")
-    assert_answer(client, query)
+    assert_no_answer(client, localizer, rgb_image(np.zeros_like(photo.image)), "0 features")
+    assert_answer(client, photo)
 
 
-def test_stream_of_unusable_images_does_not_flood_the_log(client, localizer, query):
+def test_stream_of_unusable_images_does_not_flood_the_log(client, localizer, photo):
     seen = len(client.diagnostics)
     lines = localizer.output.count("'flood' is not supported")
     for _ in range(30):
-        image = rgb_image(query.image[:4])
+        image = rgb_image(photo.image[:4])
         image.encoding = "flood"
         client.send_image(image)
         client.spin(0.05)

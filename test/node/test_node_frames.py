@@ -41,11 +41,11 @@ def tf(monkeypatch):
 
 
 @pytest.fixture
-def T_map_base(query):
+def T_map_base(photo):
     """The base on the floor under the camera, turned as the camera is."""
-    ahead = query.T_map_camera[:3, 2]
+    ahead = photo.T_map_camera[:3, 2]
     yaw = np.arctan2(ahead[1], ahead[0])
-    return make_pose(so3_exp(np.array([0.0, 0.0, yaw])), [*query.T_map_camera[:2, 3], 0.0])
+    return make_pose(so3_exp(np.array([0.0, 0.0, yaw])), [*photo.T_map_camera[:2, 3], 0.0])
 
 
 def transform(parent: str, child: str, T_parent_child: np.ndarray, stamp) -> TransformStamped:
@@ -64,16 +64,16 @@ def tell_where_the_camera_is(client, T_base_camera: np.ndarray) -> tf2_ros.Stati
     return broadcaster
 
 
-def test_priors_and_answers_of_the_base_and_tf_from_the_map_to_odom(tf, room_map_file, room_camera, query, T_map_base):
-    off = invert(query.T_map_camera) @ query.T_map_camera_prior
-    T_base_camera = invert(T_map_base) @ query.T_map_camera
+def test_priors_and_answers_of_the_base_and_tf_from_the_map_to_odom(tf, room_map_file, room_camera, photo, T_map_base):
+    off = invert(photo.T_map_camera) @ photo.T_map_camera_prior
+    T_base_camera = invert(T_map_base) @ photo.T_map_camera
     T_map_odom = T_map_base @ invert(T_ODOM_BASE)
     with running_localizer(map__path=room_map_file, **ALIGNED) as process, connected_client() as client:
         static = tell_where_the_camera_is(client, T_base_camera)
         moving, heard = tf2_ros.TransformBroadcaster(client.node), client.listen(TFMessage, "/tf")
         client.send_camera_info(info_of(room_camera))
         client.send_prior(prior_of(T_map_base @ T_base_camera @ off @ invert(T_base_camera)))
-        image = rgb_image(query.image)
+        image = rgb_image(photo.image)
         image.header.stamp = client.next_stamp()
         moving.sendTransform(transform("odom", "base_link", T_ODOM_BASE, image.header.stamp))
         client.spin(0.5)
@@ -102,10 +102,10 @@ def test_priors_and_answers_of_the_base_and_tf_from_the_map_to_odom(tf, room_map
         client.node.destroy_publisher(static)  # kept until here: static transforms come from who told them
 
 
-def test_initialpose_as_rviz_sends_it(tf, room_map_file, room_camera, query, T_map_base):
+def test_initialpose_as_rviz_sends_it(tf, room_map_file, room_camera, photo, T_map_base):
     """On the floor, a little off, with RViz's covariance: z, roll and pitch exactly known."""
     with running_localizer(map__path=room_map_file) as process, connected_client() as client:
-        static = tell_where_the_camera_is(client, invert(T_map_base) @ query.T_map_camera)
+        static = tell_where_the_camera_is(client, invert(T_map_base) @ photo.T_map_camera)
         client.send_camera_info(info_of(room_camera))
         off = make_pose(so3_exp(np.array([0.0, 0.0, 0.3])), [0.2, -0.3, 0.0])
         message = PoseWithCovarianceStamped()
@@ -114,30 +114,30 @@ def test_initialpose_as_rviz_sends_it(tf, room_map_file, room_camera, query, T_m
         message.pose.covariance[0] = message.pose.covariance[7] = 0.25
         message.pose.covariance[35] = 0.06853891909122467
         client.publish("initialpose", message)
-        image = rgb_image(query.image)
+        image = rgb_image(photo.image)
         answer = client.attempt(image)
         assert answer.ok, f"{answer.reason}\n{process.output}"
-        assert_close(client.pose_of(image), query.T_map_camera)
+        assert_close(client.pose_of(image), photo.T_map_camera)
         client.node.destroy_publisher(static)
 
 
-def test_a_prior_in_the_frame_of_odom(tf, room_map_file, room_camera, query):
+def test_a_prior_in_the_frame_of_odom(tf, room_map_file, room_camera, photo):
     T_map_odom = make_pose(so3_exp(np.array([0.1, -0.2, 2.0])), [4.0, 5.0, -1.0])
     with running_localizer(map__path=room_map_file) as process, connected_client() as client:
         static = tf2_ros.StaticTransformBroadcaster(client.node)
         static.sendTransform(transform("map", "odom", T_map_odom, client.next_stamp()))
         client.send_camera_info(info_of(room_camera))
-        client.send_prior(prior_of(invert(T_map_odom) @ query.T_map_camera_prior, "odom"))
-        image = rgb_image(query.image)
+        client.send_prior(prior_of(invert(T_map_odom) @ photo.T_map_camera_prior, "odom"))
+        image = rgb_image(photo.image)
         assert client.attempt(image).ok, process.output
-        assert_close(client.pose_of(image), query.T_map_camera)
+        assert_close(client.pose_of(image), photo.T_map_camera)
 
 
-def test_a_camera_that_tf_does_not_know(tf, room_map_file, room_camera, query):
+def test_a_camera_that_tf_does_not_know(tf, room_map_file, room_camera, photo):
     with running_localizer(map__path=room_map_file, pose_frame="base"), connected_client() as client:
         client.send_camera_info(info_of(room_camera))
-        client.send_prior(prior_of(query.T_map_camera_prior))
-        image = rgb_image(query.image)
+        client.send_prior(prior_of(photo.T_map_camera_prior))
+        image = rgb_image(photo.image)
         refused = client.attempt(image)
         assert refused.values["status"] == "refused"
         assert "tf has no transform from 'base_link' to 'camera_optical'" in refused.reason

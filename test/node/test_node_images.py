@@ -47,43 +47,43 @@ def with_covariance(T_map_camera: np.ndarray, covariance: np.ndarray) -> PoseWit
 
 
 @pytest.mark.parametrize("extension", ["png", "jpg"])
-def test_compressed_rectified_images_are_localized(client, room_camera, rectified_info, query, extension):
+def test_compressed_rectified_images_are_localized(client, room_camera, rectified_info, photo, extension):
     client.send_camera_info(rectified_info)
-    client.send_prior(prior_of(query.T_map_camera_prior))
-    image = compressed_image(room_camera.undistort_image(query.image), extension)
+    client.send_prior(prior_of(photo.T_map_camera_prior))
+    image = compressed_image(room_camera.undistort_image(photo.image), extension)
     diagnostic = client.attempt(image)
     assert diagnostic.ok, diagnostic
-    assert_close(client.pose_of(image), query.T_map_camera)
+    assert_close(client.pose_of(image), photo.T_map_camera)
 
 
 def test_camera_info_without_p_is_refused(client, room_camera):
     client.until_refused(lambda: client.send_camera_info(info_of(room_camera)), "a P of zeros")
 
 
-def test_a_damaged_image_is_refused(client, rectified_info, query):
+def test_a_damaged_image_is_refused(client, rectified_info, photo):
     client.send_camera_info(rectified_info)
-    client.send_prior(prior_of(query.T_map_camera_prior))
+    client.send_prior(prior_of(photo.T_map_camera_prior))
     diagnostic = client.attempt(CompressedImage(format="jpeg", data=b"\xff\xd8\xff no picture"))
     assert diagnostic.values["status"] == "refused"
     assert "damaged" in diagnostic.reason
-    assert client.attempt(compressed_image(query.image, "png")).values["status"] != "refused"
+    assert client.attempt(compressed_image(photo.image, "png")).values["status"] != "refused"
 
 
-def test_the_priors_covariance_says_where_to_search(client, room_camera, rectified_info, query):
+def test_the_priors_covariance_says_where_to_search(client, room_camera, rectified_info, photo):
     client.send_camera_info(rectified_info)
-    away = query.T_map_camera @ make_pose(so3_exp(np.radians([0.0, 100.0, 0.0])), np.zeros(3))
-    image = compressed_image(room_camera.undistort_image(query.image), "png")
+    away = photo.T_map_camera @ make_pose(so3_exp(np.radians([0.0, 100.0, 0.0])), np.zeros(3))
+    image = compressed_image(room_camera.undistort_image(photo.image), "png")
     client.send_prior(with_covariance(away, np.diag([1e-4] * 3 + [1e-4] * 3)))
     assert client.attempt(image).values["status"] in ("failed", "rejected")
     client.send_prior(with_covariance(away, np.diag([0.01] * 3 + [1.0] * 3)))
     diagnostic = client.attempt(image)
     assert diagnostic.ok, diagnostic
     assert int(diagnostic.values["views"]) > 0
-    assert_close(client.pose_of(image), query.T_map_camera)
+    assert_close(client.pose_of(image), photo.T_map_camera)
 
 
 @pytest.mark.parametrize("value", [float("nan"), -1.0])
-def test_a_covariance_that_is_none_is_refused(client, query, value):
+def test_a_covariance_that_is_none_is_refused(client, photo, value):
     covariance = np.diag([value] * 6)
-    message = with_covariance(query.T_map_camera, covariance)
+    message = with_covariance(photo.T_map_camera, covariance)
     client.until_refused(lambda: client.send_prior(message), "prior has covariance")

@@ -34,16 +34,16 @@ def test_service_says_what_is_missing(room_map_file):
         assert "no prior yet: publish geometry_msgs/PoseStamped on /prior" in answer.message
 
 
-def test_answers_from_renders_at_half_the_size(room_map_file, room_camera, room_queries):
+def test_answers_from_renders_at_half_the_size(room_map_file, room_camera, room_photos):
     parameters = {"matcher__name": "sift", "renderer__resolution_scale": 0.5, "renderer__sh_degree": 0}
     with running_localizer(map__path=room_map_file, **parameters) as process, connected_client() as client:
-        query = room_queries[0]
+        photo = room_photos[0]
         client.send_camera_info(info_of(room_camera))
-        client.send_prior(prior_of(query.T_map_camera_prior))
-        message = rgb_image(query.image)
+        client.send_prior(prior_of(photo.T_map_camera_prior))
+        message = rgb_image(photo.image)
         answer = client.attempt(message)
         assert answer.ok, f"{answer.reason}\n{process.output}"
-        assert_close(client.pose_of(message), query.T_map_camera)
+        assert_close(client.pose_of(message), photo.T_map_camera)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -52,12 +52,12 @@ def test_signal_while_idle_ends_it_cleanly(room_map_file, number):
         assert_clean_end(process, number)
 
 
-def test_signal_while_busy_answers_the_requests_first(room_map_file, room_camera, room_queries):
+def test_signal_while_busy_answers_the_requests_first(room_map_file, room_camera, room_photos):
     with running_localizer(map__path=room_map_file, matcher__name="sift") as process, connected_client() as client:
-        query = room_queries[0]
+        photo = room_photos[0]
         client.send_camera_info(info_of(room_camera))
-        client.send_prior(prior_of(query.T_map_camera_prior))
-        assert client.attempt(rgb_image(query.image)).ok
+        client.send_prior(prior_of(photo.T_map_camera_prior))
+        assert client.attempt(rgb_image(photo.image)).ok
         requests = [client.send_request() for _ in range(3)]
         client.spin(0.2)
         assert_clean_end(process, signal.SIGTERM)
@@ -109,8 +109,8 @@ def change(client: Client, transition: int) -> bool:
     return client.call(ChangeState, "localizer/change_state", request, 180.0).success
 
 
-def test_a_lifecycle_manager_drives_it(room_map_file, room_camera, room_queries):
-    query = room_queries[0]
+def test_a_lifecycle_manager_drives_it(room_map_file, room_camera, room_photos):
+    photo = room_photos[0]
     process = NodeProcess(*node_arguments(map__path=room_map_file, autostart=False))
     client = Client()
     try:
@@ -125,12 +125,12 @@ def test_a_lifecycle_manager_drives_it(room_map_file, room_camera, room_queries)
             assert change(client, Transition.TRANSITION_ACTIVATE)
             client.connect()
             client.send_camera_info(info_of(room_camera))
-            client.send_prior(prior_of(query.T_map_camera_prior))
-            image = rgb_image(query.image)
+            client.send_prior(prior_of(photo.T_map_camera_prior))
+            image = rgb_image(photo.image)
             assert client.attempt(image).ok
-            assert_close(client.pose_of(image), query.T_map_camera)
+            assert_close(client.pose_of(image), photo.T_map_camera)
             assert change(client, Transition.TRANSITION_DEACTIVATE)
-            assert not client.is_tried(client.send_once(query.image), 1.0)
+            assert not client.is_tried(client.send_once(photo.image), 1.0)
             assert change(client, Transition.TRANSITION_CLEANUP)
             assert state(client) == State.PRIMARY_STATE_UNCONFIGURED
         assert change(client, Transition.TRANSITION_UNCONFIGURED_SHUTDOWN)

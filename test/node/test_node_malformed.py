@@ -46,25 +46,25 @@ def localizer(room_map_file):
 
 # One for all tests: to find each other takes longer than all the rest.
 @pytest.fixture(scope="module")
-def client(localizer, room_camera, room_queries):
+def client(localizer, room_camera, room_photos):
     with connected_client() as client:
-        send_good(client, room_camera, room_queries[0])
+        send_good(client, room_camera, room_photos[0])
         yield client
 
 
 @pytest.fixture
-def good(client, localizer, room_camera, query):
+def good(client, localizer, room_camera, photo):
     """The localizer with good inputs; after a test it is still there and able to answer."""
     assert localizer.alive, localizer.output
     printed = len(localizer.output)
     yield client
     assert "Traceback" not in localizer.output[printed:]
-    send_good(client, room_camera, query)
+    send_good(client, room_camera, photo)
 
 
-def send_good(client: Client, camera, query) -> None:
-    send_inputs(client, camera, query)
-    assert_answer(client, query)
+def send_good(client: Client, camera, photo) -> None:
+    send_inputs(client, camera, photo)
+    assert_answer(client, photo)
 
 
 # Messages of each topic
@@ -96,16 +96,16 @@ def test_camera_infos(good, room_camera):
         ("initialpose", PoseWithCovarianceStamped, "initialpose"),
     ],
 )
-def test_priors(good, query, topic, message_type, name):
+def test_priors(good, photo, topic, message_type, name):
     @examples(25)
-    @given(poses(prior_of(query.T_map_camera_prior), message_type, name))
+    @given(poses(prior_of(photo.T_map_camera_prior), message_type, name))
     def check(case):
         assert_refused(good, topic, *case)
 
     check()
 
 
-def test_odometry(good, localizer, query):
+def test_odometry(good, localizer, photo):
     """It says nothing of where the robot is: what is malformed is said, and the prior is still good."""
 
     @examples(20)
@@ -119,7 +119,7 @@ def test_odometry(good, localizer, query):
 
     check()
     localizer.wait_for_output(r"\[WARN\].*odom has position .* must be finite")
-    assert_answer(good, query)
+    assert_answer(good, photo)
 
 
 # What is finite, and yet no camera has it and no robot is there
@@ -166,14 +166,14 @@ def assert_no_pose_came(client: Client, before: set[str]) -> None:
     assert client.poses.keys() == before
 
 
-def test_cameras_of_absurd_values(good, room_camera, query):
+def test_cameras_of_absurd_values(good, room_camera, photo):
     before = set(good.poses)
     for changes in ABSURD_CAMERAS:
         info = info_of(room_camera)
         for name, value in changes.items():
             setattr(info, name, value)
         good.send_camera_info(info)
-        attempt_without_pose(good, rgb_image(query.image), changes)
+        attempt_without_pose(good, rgb_image(photo.image), changes)
     assert_no_pose_came(good, before)
 
 
@@ -195,40 +195,40 @@ def at(position: list[float], covariance: np.ndarray | None = None) -> PoseWithC
     return message
 
 
-def test_priors_of_absurd_places(good, query):
+def test_priors_of_absurd_places(good, photo):
     before = set(good.poses)
     for far in (1e4, 1e9, 1e20, 1e38, 1e200, 1e308):
         good.send_prior(at([-far, far, -far]))
-        attempt_without_pose(good, rgb_image(query.image), far)
+        attempt_without_pose(good, rgb_image(photo.image), far)
     assert_no_pose_came(good, before)
 
 
 @pytest.mark.parametrize("topic", ["prior_with_covariance", "initialpose"])
-def test_priors_of_absurd_covariances(good, query, topic):
+def test_priors_of_absurd_covariances(good, photo, topic):
     """The place is right: there is the right answer, or none."""
     for name, covariance in ABSURD_COVARIANCES.items():
         message = at([0.0, 0.0, 0.0], covariance)
-        message.pose.pose = prior_of(query.T_map_camera_prior).pose
+        message.pose.pose = prior_of(photo.T_map_camera_prior).pose
         good.publish(topic, message)
-        image = rgb_image(query.image)
+        image = rgb_image(photo.image)
         diagnostic = good.attempt(image)
         assert diagnostic.values["status"] in ("localized", "refused", "failed", "rejected"), (name, diagnostic)
         if diagnostic.ok:
-            assert_close(good.pose_of(image), query.T_map_camera)
+            assert_close(good.pose_of(image), photo.T_map_camera)
         else:
             assert text(image) not in good.poses, name
 
 
-def test_impossible_correlations_do_not_open_the_gate(good, query):
+def test_impossible_correlations_do_not_open_the_gate(good, photo):
     """An answer too far from a sure prior is not believed: neither is it if the prior's covariance is none."""
-    T_map_camera_prior = query.T_map_camera.copy()
+    T_map_camera_prior = photo.T_map_camera.copy()
     T_map_camera_prior[:3, 3] -= 0.7 * T_map_camera_prior[:3, 2]
     before = set(good.poses)
     for correlation in (0.0, 1e4, 1e6):
         message = at([0.0, 0.0, 0.0], 1e-6 * ((1.0 - correlation) * np.eye(6) + correlation * np.ones((6, 6))))
         message.pose.pose = prior_of(T_map_camera_prior).pose
         good.send_prior(message)
-        diagnostic = attempt_without_pose(good, rgb_image(query.image), correlation)
+        diagnostic = attempt_without_pose(good, rgb_image(photo.image), correlation)
         assert correlation or "standard deviations from the prior" in diagnostic.reason
     assert_no_pose_came(good, before)
 
@@ -238,15 +238,15 @@ def attempt_as_stamped(client: Client, image: Image) -> Diagnostic:
     return client.until_diagnosed(lambda: client.send_image(image), lambda d: d.values.get("stamp") == text(image))
 
 
-def test_stamps_of_no_time(good, query):
+def test_stamps_of_no_time(good, photo):
     """The prior has none, so that it holds at any time."""
     for sec, nanosec in ((-1, 0), (-(2**31), 2**32 - 1), (2**31 - 1, 2**32 - 1), (5, 2**32 - 1), (0, 0)):
-        good.send_prior(prior_of(query.T_map_camera_prior))
-        image = rgb_image(query.image)
+        good.send_prior(prior_of(photo.T_map_camera_prior))
+        image = rgb_image(photo.image)
         image.header.stamp = Time(sec=sec, nanosec=nanosec)
         diagnostic = attempt_as_stamped(good, image)
         if diagnostic.ok:
-            assert_close(good.pose_of(image), query.T_map_camera)
+            assert_close(good.pose_of(image), photo.T_map_camera)
         else:
             assert diagnostic.values["status"] == "refused", diagnostic
             assert text(image) not in good.poses
@@ -296,9 +296,9 @@ def test_bytes_that_are_no_message(good, topic, message):
 # Requests
 
 
-def test_requests_to_localize_an_image(good, room_camera, query):
+def test_requests_to_localize_an_image(good, room_camera, photo):
     """The camera and the prior of the topics are good: what is wrong is the request's alone."""
-    prior = prior_of(query.T_map_camera_prior)
+    prior = prior_of(photo.T_map_camera_prior)
 
     def check(request: LocalizeImage.Request, says: str) -> None:
         response = good.call(LocalizeImage, "localizer/localize_image", request)
@@ -319,13 +319,13 @@ def test_requests_to_localize_an_image(good, room_camera, query):
     @given(camera_infos(room_camera))
     def check_camera(case):
         info, says = case
-        check(LocalizeImage.Request(image=rgb_image(query.image), camera_info=info), says)
+        check(LocalizeImage.Request(image=rgb_image(photo.image), camera_info=info), says)
 
     @examples(10)
     @given(poses(prior, PoseWithCovarianceStamped, "prior"))
     def check_prior(case):
         message, says = case
-        image = rgb_image(query.image)
+        image = rgb_image(photo.image)
         image.header.stamp = Time(sec=1)
         check(LocalizeImage.Request(image=image, camera_info=info_of(room_camera), has_prior=True, prior=message), says)
 

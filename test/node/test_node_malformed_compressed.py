@@ -28,27 +28,27 @@ def peak_memory(localizer: NodeProcess) -> float:
     return int(re.search(r"VmHWM:\s+(\d+) kB", status).group(1)) / 1024
 
 
-def test_compressed_images(room_map_file, room_camera, room_queries):
-    query = room_queries[0]
-    encoded = cv2.imencode(".jpeg", query.image[:, :, ::-1])[1].tobytes()
+def test_compressed_images(room_map_file, room_camera, room_photos):
+    photo = room_photos[0]
+    encoded = cv2.imencode(".jpeg", photo.image[:, :, ::-1])[1].tobytes()
     with (
         running_localizer(map__path=room_map_file, **PARAMETERS) as localizer,
         connected_client(transport="compressed") as client,
     ):
         client.send_camera_info(info_of(room_camera))
-        client.send_prior(prior_of(query.T_map_camera_prior))
+        client.send_prior(prior_of(photo.T_map_camera_prior))
 
         def assert_good_one_is_answered() -> None:
             image = CompressedImage(format="jpeg", data=encoded)
             image.header.frame_id = "camera_optical"
             assert client.attempt(image).ok
-            assert_close(client.pose_of(image), query.T_map_camera)
+            assert_close(client.pose_of(image), photo.T_map_camera)
 
         assert_good_one_is_answered()
         before = peak_memory(localizer)
 
         @examples(50)
-        @given(compressed_images(query.image))
+        @given(compressed_images(photo.image))
         def check(case):
             assert_refused(client, "image/compressed", *case)
 
@@ -62,7 +62,7 @@ def test_compressed_images(room_map_file, room_camera, room_queries):
             image.header.frame_id = "camera_optical"
             diagnostic = client.attempt(image)
             if diagnostic.ok:
-                assert_close(client.pose_of(image), query.T_map_camera)
+                assert_close(client.pose_of(image), photo.T_map_camera)
             else:
                 assert diagnostic.values["status"] in ("refused", "failed", "rejected")
         assert peak_memory(localizer) - before < 300.0

@@ -70,16 +70,16 @@ def connected(localizer):
 
 
 @pytest.fixture
-def client(connected, localizer, room_camera, query):
+def client(connected, localizer, room_camera, photo):
     assert localizer.alive, localizer.output
-    send_inputs(connected, room_camera, query)
+    send_inputs(connected, room_camera, photo)
     yield connected
     assert "Traceback" not in localizer.output
 
 
-def send_image(client: Client, query) -> str:
+def send_image(client: Client, photo) -> str:
     """Send an image, and return its stamp."""
-    image = rgb_image(query.image)
+    image = rgb_image(photo.image)
     image.header.stamp = client.next_stamp()
     client.send_image(image)
     return text(image)
@@ -150,22 +150,22 @@ def test_signal_while_a_map_is_loaded(room_map_file, moved_map_file):
 
 
 @pytest.mark.parametrize("spoil", SPOILERS)
-def test_map_file_is_spoilt_while_in_use(client, map_file, room_map_file, query, spoil: Callable[[Path], None]):
+def test_map_file_is_spoilt_while_in_use(client, map_file, room_map_file, photo, spoil: Callable[[Path], None]):
     shutil.copy(room_map_file, map_file)
     cache = map_file.with_name(map_file.name + SUFFIX)
     cache.write_bytes(b"garbage")
     spoil(map_file)
-    assert_answer(client, query)
+    assert_answer(client, photo)
     assert_map_is_not_taken(client, map_file, map_file)
-    assert_answer(client, query)
+    assert_answer(client, photo)
 
 
 @pytest.mark.parametrize("spoil", SPOILERS)
-def test_another_map_is_garbage(client, map_file, room_map_file, query, tmp_path, spoil: Callable[[Path], None]):
+def test_another_map_is_garbage(client, map_file, room_map_file, photo, tmp_path, spoil: Callable[[Path], None]):
     other = shutil.copy(room_map_file, tmp_path / "other.ply")
     spoil(other)
     assert_map_is_not_taken(client, other, map_file)
-    assert_answer(client, query)
+    assert_answer(client, photo)
 
 
 @pytest.mark.parametrize(
@@ -173,12 +173,12 @@ def test_another_map_is_garbage(client, map_file, room_map_file, query, tmp_path
     ["", "/nowhere/room.ply", "/", "/dev/zero", "/proc/self/mem", "\u00e4\u6f22\U0001f600", "too long" * 100],
     ids=lambda path: path[:20],
 )
-def test_path_of_no_map(client, map_file, query, path):
+def test_path_of_no_map(client, map_file, photo, path):
     assert_map_is_not_taken(client, path, map_file)
-    assert_answer(client, query)
+    assert_answer(client, photo)
 
 
-def test_spoilt_cache_is_not_used(client, map_file, room_map_file, query):
+def test_spoilt_cache_is_not_used(client, map_file, room_map_file, photo):
     shutil.copy(room_map_file, map_file)
     cache = map_file.with_name(map_file.name + SUFFIX)
     cache.write_bytes(np.random.default_rng(0).bytes(100_000))
@@ -186,36 +186,36 @@ def test_spoilt_cache_is_not_used(client, map_file, room_map_file, query):
     assert client.set_parameter("map.path", str(map_file)).successful
     assert client.spin_until(lambda: len(client.maps) > seen, TIMEOUT)
     assert client.maps[-1].ok, client.maps[-1]
-    assert_answer(client, query)
+    assert_answer(client, photo)
 
 
-def test_another_map_serves_once_it_is_loaded(client, map_file, room_map_file, moved_map_file, query):
+def test_another_map_serves_once_it_is_loaded(client, map_file, room_map_file, moved_map_file, photo):
     """Until then the old one does."""
     shutil.copy(room_map_file, map_file)
-    assert_answer(client, query)
+    assert_answer(client, photo)
     seen, answered_meanwhile = len(client.maps), 0
     assert client.set_parameter("map.path", str(moved_map_file)).successful
     assert "is being loaded" in client.set_parameter("map.path", str(map_file)).reason
     while len(client.maps) == seen:
-        stamp = send_image(client, query)
+        stamp = send_image(client, photo)
         client.spin_until(lambda stamp=stamp: stamp in client.poses or len(client.maps) > seen, RESEND_PERIOD)
         if stamp in client.poses:
-            assert_close(client.poses[stamp], query.T_map_camera)
+            assert_close(client.poses[stamp], photo.T_map_camera)
             answered_meanwhile += 1
     assert client.maps[-1].ok, client.maps[-1]
     assert answered_meanwhile >= 1
     assert client.parameter("map.path") == str(moved_map_file)
     # The old prior is of nowhere now.
-    image = rgb_image(query.image)
+    image = rgb_image(photo.image)
     assert not client.attempt(image).ok
     assert client.pose_of(image) is None
-    client.send_prior(prior_of(moved(query.T_map_camera_prior)))
-    image = rgb_image(query.image)
+    client.send_prior(prior_of(moved(photo.T_map_camera_prior)))
+    image = rgb_image(photo.image)
     assert client.attempt(image).ok
-    assert_close(client.pose_of(image), moved(query.T_map_camera))
+    assert_close(client.pose_of(image), moved(photo.T_map_camera))
     # And back.
     seen = len(client.maps)
     assert client.set_parameter("map.path", str(map_file)).successful
     assert client.spin_until(lambda: len(client.maps) > seen, TIMEOUT)
-    client.send_prior(prior_of(query.T_map_camera_prior))
-    assert_answer(client, query)
+    client.send_prior(prior_of(photo.T_map_camera_prior))
+    assert_answer(client, photo)

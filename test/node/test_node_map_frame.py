@@ -60,7 +60,7 @@ def test_alignment_is_scale_then_rotation_then_translation_after_nerfstudio(tmp_
     np.testing.assert_allclose(map_alignment(values).transform(points), expected, atol=1e-9)
 
 
-def test_answers_are_in_the_frame_of_the_robot(room_map_file, room_camera, room_queries):
+def test_answers_are_in_the_frame_of_the_robot(room_map_file, room_camera, room_photos):
     parameters = {
         "map__path": room_map_file,
         "map__scale": ALIGNMENT.scale,
@@ -71,12 +71,12 @@ def test_answers_are_in_the_frame_of_the_robot(room_map_file, room_camera, room_
     }
     with running_localizer(**parameters) as process, connected_client() as client:
         client.send_camera_info(info_of(room_camera))
-        for query in room_queries[:2]:
-            client.send_prior(prior_of(ALIGNMENT.transform_pose(query.T_map_camera_prior)))
-            message = rgb_image(query.image)
+        for photo in room_photos[:2]:
+            client.send_prior(prior_of(ALIGNMENT.transform_pose(photo.T_map_camera_prior)))
+            message = rgb_image(photo.image)
             answer = client.attempt(message)
             assert answer.ok, f"{answer.reason}\n{process.output}"
-            pose, truth = matrix_of(client.pose_of(message)), ALIGNMENT.transform_pose(query.T_map_camera)
+            pose, truth = matrix_of(client.pose_of(message)), ALIGNMENT.transform_pose(photo.T_map_camera)
             assert rotation_error_deg(pose, truth) < 1.0
             assert translation_error(pose, truth) < 0.02 * ALIGNMENT.scale
 

@@ -28,34 +28,34 @@ def client(localizer, room_camera):
             assert client.set_parameter(name, value).successful
 
 
-def test_on_request_only_services_localize(client, query):
-    client.send_prior(prior_of(query.T_map_camera_prior))
+def test_on_request_only_services_localize(client, photo):
+    client.send_prior(prior_of(photo.T_map_camera_prior))
     assert client.set_parameter("mode", "on_request").successful
-    image = client.send_once(query.image)
+    image = client.send_once(photo.image)
     assert not client.is_tried(image)
     answer = client.relocalize()
     assert answer.success, answer.message
-    assert_close(client.pose_of(image), query.T_map_camera)
+    assert_close(client.pose_of(image), photo.T_map_camera)
 
 
-def test_on_prior_one_image_for_each(client, query):
+def test_on_prior_one_image_for_each(client, photo):
     assert client.set_parameter("mode", "on_prior").successful
-    client.send_prior(prior_of(query.T_map_camera_prior))
+    client.send_prior(prior_of(photo.T_map_camera_prior))
     for _ in range(2):
-        image = client.send_once(query.image)
+        image = client.send_once(photo.image)
         assert client.is_tried(image, TIMEOUT)
-        assert_close(client.pose_of(image), query.T_map_camera)
-        assert not client.is_tried(client.send_once(query.image), 1.0)
-        client.send_prior(prior_of(query.T_map_camera_prior))
+        assert_close(client.pose_of(image), photo.T_map_camera)
+        assert not client.is_tried(client.send_once(photo.image), 1.0)
+        client.send_prior(prior_of(photo.T_map_camera_prior))
 
 
-def test_no_more_images_a_second_than_allowed(client, query):
-    client.send_prior(prior_of(query.T_map_camera_prior))
+def test_no_more_images_a_second_than_allowed(client, photo):
+    client.send_prior(prior_of(photo.T_map_camera_prior))
     assert client.set_parameter("max_rate", 0.25).successful
     # Stamps are a second apart: of eight images two are tried.
     images = []
     for _ in range(8):
-        images.append(client.send_once(query.image))
+        images.append(client.send_once(photo.image))
         client.spin(1.0)
     assert [client.is_tried(image, 1.0) for image in images].count(True) == 2
 
@@ -79,14 +79,14 @@ def test_parameters_that_cannot_be_set_stay_as_they_are(client, name, value, say
     assert client.parameter(name) == before
 
 
-def test_options_of_the_localizer_change_while_it_runs(client, query):
-    client.send_prior(prior_of(query.T_map_camera_prior))
+def test_options_of_the_localizer_change_while_it_runs(client, photo):
+    client.send_prior(prior_of(photo.T_map_camera_prior))
     assert client.set_parameter("localizer.min_inliers", 5000).successful
-    refused = client.attempt(rgb_image(query.image))
+    refused = client.attempt(rgb_image(photo.image))
     assert refused.values["status"] == "rejected"
     assert "at least 5000 needed" in refused.reason
     assert client.set_parameter("localizer.min_inliers", 20).successful
-    assert client.attempt(rgb_image(query.image)).ok
+    assert client.attempt(rgb_image(photo.image)).ok
 
 
 def test_descriptions_say_which_parameters_can_be_set(client):
@@ -97,9 +97,9 @@ def test_descriptions_say_which_parameters_can_be_set(client):
     assert mode.additional_constraints == "One of continuous, on_prior, on_request."
 
 
-def test_health_says_how_it_goes(client, room_map_file, query):
-    client.send_prior(prior_of(query.T_map_camera_prior))
-    assert client.attempt(rgb_image(query.image)).ok
+def test_health_says_how_it_goes(client, room_map_file, photo):
+    client.send_prior(prior_of(photo.T_map_camera_prior))
+    assert client.attempt(rgb_image(photo.image)).ok
     seen = len(client.health)
     assert client.spin_until(lambda: len(client.health) > seen)
     values = client.health[-1].values
@@ -113,12 +113,12 @@ def test_health_says_how_it_goes(client, room_map_file, query):
     assert "inliers of" in values["last_reason"]
 
 
-def test_debug_image_shows_photo_and_render_and_is_drawn_for_refused_ones_too(client, room_camera, query):
+def test_debug_image_shows_photo_and_render_and_is_drawn_for_refused_ones_too(client, room_camera, photo):
     pictures = client.listen(Image, "debug_image")
-    client.send_prior(prior_of(query.T_map_camera_prior))
+    client.send_prior(prior_of(photo.T_map_camera_prior))
     for info in (info_of(room_camera), info_of(room_camera.scaled(320, 240))):
         client.send_camera_info(info)
-        image = rgb_image(query.image)
+        image = rgb_image(photo.image)
         client.attempt(image)
         assert client.spin_until(lambda image=image: any(text(picture) == text(image) for picture in pictures))
         picture = pictures[-1]
@@ -128,13 +128,13 @@ def test_debug_image_shows_photo_and_render_and_is_drawn_for_refused_ones_too(cl
         assert (pixels[:480, 640:].std() > 20) == (info.width == 640)
 
 
-def test_initialpose_needs_tf(client, query):
+def test_initialpose_needs_tf(client, photo):
     message = PoseWithCovarianceStamped(header=Header(frame_id="map"))
-    message.pose.pose = prior_of(query.T_map_camera_prior).pose
+    message.pose.pose = prior_of(photo.T_map_camera_prior).pose
     client.publish("initialpose", message)
-    refused = client.attempt(rgb_image(query.image))
+    refused = client.attempt(rgb_image(photo.image))
     assert refused.values["status"] == "refused"
     assert "tf" in refused.reason
     assert not client.relocalize().success
-    client.send_prior(prior_of(query.T_map_camera_prior))
-    assert client.attempt(rgb_image(query.image)).ok
+    client.send_prior(prior_of(photo.T_map_camera_prior))
+    assert client.attempt(rgb_image(photo.image)).ok

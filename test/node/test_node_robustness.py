@@ -54,18 +54,18 @@ def assert_health(client: Client, level: bytes, says: str = "") -> None:
     assert client.spin_until(found, TIMEOUT), client.health[seen:]
 
 
-def test_sensor_stops_and_returns(client, room_camera, query):
-    send_inputs(client, room_camera, query)
-    assert_answer(client, query)
+def test_sensor_stops_and_returns(client, room_camera, photo):
+    send_inputs(client, room_camera, photo)
+    assert_answer(client, photo)
     assert_health(client, DiagnosticStatus.ERROR, r"no image for \d+ s: is the camera running\?")
     answer = client.relocalize()
     assert not answer.success
     assert re.fullmatch(r"the newest image came \d+\.\d s ago: is the camera running\?", answer.message)
-    assert_answer(client, query)
+    assert_answer(client, photo)
     assert client.relocalize().success
     seen = len(client.health)
     while not any(health.ok for health in client.health[seen:]):
-        assert_answer(client, query)
+        assert_answer(client, photo)
         assert len(client.health) - seen < 20, client.health[seen:]
 
 
@@ -79,15 +79,15 @@ def camera_process(picture: Path) -> Iterator[subprocess.Popen]:
         process.wait(TIMEOUT)
 
 
-def test_publisher_is_killed_and_another_one_starts(client, room_camera, query, tmp_path):
-    np.save(tmp_path / "picture.npy", query.image)
-    send_inputs(client, room_camera, query)
+def test_publisher_is_killed_and_another_one_starts(client, room_camera, photo, tmp_path):
+    np.save(tmp_path / "picture.npy", photo.image)
+    send_inputs(client, room_camera, photo)
 
     def assert_served() -> None:
         before = set(client.poses)
         assert client.spin_until(lambda: len(client.poses.keys() - before) >= 3, TIMEOUT)
         for stamp in client.poses.keys() - before:
-            assert_close(client.poses[stamp], query.T_map_camera)
+            assert_close(client.poses[stamp], photo.T_map_camera)
 
     with camera_process(tmp_path / "picture.npy") as camera:
         assert_served()
@@ -103,34 +103,34 @@ def test_publisher_is_killed_and_another_one_starts(client, room_camera, query, 
 
 
 @pytest.mark.parametrize("jump", [[100.0, 0.0, 0.0], [0.0, -100.0, 0.0], [0.0, 0.0, 100.0]])
-def test_prior_jumps_100_m(client, room_camera, query, jump):
-    send_inputs(client, room_camera, query)
-    assert_answer(client, query)
-    far = query.T_map_camera_prior.copy()
+def test_prior_jumps_100_m(client, room_camera, photo, jump):
+    send_inputs(client, room_camera, photo)
+    assert_answer(client, photo)
+    far = photo.T_map_camera_prior.copy()
     far[:3, 3] += jump
     client.send_prior(prior_of(far))
-    assert_no_answer(client, query, "photo and renders at the prior and in .* have nothing in common|not believed")
-    client.send_prior(prior_of(query.T_map_camera_prior))
-    assert_answer(client, query)
+    assert_no_answer(client, photo, "photo and renders at the prior and in .* have nothing in common|not believed")
+    client.send_prior(prior_of(photo.T_map_camera_prior))
+    assert_answer(client, photo)
 
 
-def test_prior_stale_or_of_the_future(client, room_camera, query):
-    send_inputs(client, room_camera, query)
-    client.send_prior(stamped(prior_of(query.T_map_camera_prior), 100_000))
-    assert_answer(client, query, 100_009)
-    assert_no_answer(client, query, r"prior is 11\.0 s older than the image .*prior_max_age.*send a newer one", 100_011)
-    assert_no_answer(client, query, r"prior is 11\.0 s newer than the image .*prior_max_age.*clocks", 99_989)
-    assert_answer(client, query, 99_991)
+def test_prior_stale_or_of_the_future(client, room_camera, photo):
+    send_inputs(client, room_camera, photo)
+    client.send_prior(stamped(prior_of(photo.T_map_camera_prior), 100_000))
+    assert_answer(client, photo, 100_009)
+    assert_no_answer(client, photo, r"prior is 11\.0 s older than the image .*prior_max_age.*send a newer one", 100_011)
+    assert_no_answer(client, photo, r"prior is 11\.0 s newer than the image .*prior_max_age.*clocks", 99_989)
+    assert_answer(client, photo, 99_991)
 
 
-def test_stamps_go_back(client, room_camera, query):
-    send_inputs(client, room_camera, query)
-    prior = prior_of(query.T_map_camera_prior)
+def test_stamps_go_back(client, room_camera, photo):
+    send_inputs(client, room_camera, photo)
+    prior = prior_of(photo.T_map_camera_prior)
     client.send_prior(stamped(prior, 200_100))
-    assert_answer(client, query, 200_100)
-    assert_no_answer(client, query, r"prior is 100\.0 s newer than the image .*prior_max_age", 200_000)
+    assert_answer(client, photo, 200_100)
+    assert_no_answer(client, photo, r"prior is 100\.0 s newer than the image .*prior_max_age", 200_000)
     client.send_prior(stamped(prior, 200_000))
-    assert_answer(client, query, 200_000)
+    assert_answer(client, photo, 200_000)
     # Late, and out of order.
     client.send_prior(stamped(prior, 199_900))
-    assert_no_answer(client, query, r"prior is 101\.0 s older than the image .*prior_max_age", 200_001)
+    assert_no_answer(client, photo, r"prior is 101\.0 s older than the image .*prior_max_age", 200_001)

@@ -26,28 +26,28 @@ END_TIMEOUT = 8.0
 ANSWER_TIMEOUT = 10.0
 
 
-def send_good(client: Client, camera, query) -> None:
-    send_inputs(client, camera, query)
-    assert_answer(client, query)
+def send_good(client: Client, camera, photo) -> None:
+    send_inputs(client, camera, photo)
+    assert_answer(client, photo)
 
 
-def test_signal_in_the_middle_of_a_localization(room_map_file, room_camera, room_queries):
+def test_signal_in_the_middle_of_a_localization(room_map_file, room_camera, room_photos):
     """One of many seconds: all of a wide prior is searched for a photo that shows nothing of the map."""
-    query = room_queries[0]
+    photo = room_photos[0]
     parameters = {"map__path": room_map_file, "matcher__name": "sift", "localizer__max_views": 1000}
     with running_localizer(**parameters) as localizer, connected_client() as client:
         client.send_camera_info(info_of(room_camera))
-        wide = PoseWithCovarianceStamped(header=prior_of(query.T_map_camera).header)
-        wide.pose.pose = prior_of(query.T_map_camera).pose
+        wide = PoseWithCovarianceStamped(header=prior_of(photo.T_map_camera).header)
+        wide.pose.pose = prior_of(photo.T_map_camera).pose
         wide.pose.covariance = np.diag([1.0, 1.0, 1.0, 10.0, 10.0, 10.0]).ravel().tolist()
         client.send_prior(wide)
-        mirrored = rgb_image(np.ascontiguousarray(query.image[:, ::-1]))
+        mirrored = rgb_image(np.ascontiguousarray(photo.image[:, ::-1]))
         mirrored.header.stamp = client.next_stamp()
         client.send_image(mirrored)
         client.spin(0.5)
         running = client.send_request()
         client.spin(0.5)
-        newer = rgb_image(np.ascontiguousarray(query.image[::-1]))
+        newer = rgb_image(np.ascontiguousarray(photo.image[::-1]))
         newer.header.stamp = client.next_stamp()
         client.send_image(newer)
         client.spin(0.5)
@@ -66,10 +66,10 @@ def test_signal_in_the_middle_of_a_localization(room_map_file, room_camera, room
         assert client.poses == {}
 
 
-def test_transitions_that_the_state_does_not_allow(room_map_file, room_camera, room_queries):
-    query = room_queries[0]
+def test_transitions_that_the_state_does_not_allow(room_map_file, room_camera, room_photos):
+    photo = room_photos[0]
     with running_localizer(map__path=room_map_file, matcher__name="sift") as localizer, connected_client() as client:
-        send_good(client, room_camera, query)
+        send_good(client, room_camera, photo)
 
         def change(number: int, label: str = "") -> bool:
             request = ChangeState.Request()
@@ -86,20 +86,20 @@ def test_transitions_that_the_state_does_not_allow(room_map_file, room_camera, r
         for label in ("configure", "cleanup", "no such transition", "transition_success", "\u6f22"):
             assert not change(0, label), label
             assert state() == "active", label
-        assert_answer(client, query)
+        assert_answer(client, photo)
         assert change(4)
         assert state() == "inactive"
         assert not change(4)
         assert not change(1)
         assert change(3)
-        assert_answer(client, query)
+        assert_answer(client, photo)
         assert "Traceback" not in localizer.output
 
 
-def test_clean_up_while_requests_wait(room_map_file, room_camera, room_queries):
-    query = room_queries[0]
+def test_clean_up_while_requests_wait(room_map_file, room_camera, room_photos):
+    photo = room_photos[0]
     with running_localizer(map__path=room_map_file, matcher__name="sift") as localizer, connected_client() as client:
-        send_good(client, room_camera, query)
+        send_good(client, room_camera, photo)
         futures = [client.send_request() for _ in range(3)]
 
         def change(number: int) -> rclpy.Future:
@@ -117,5 +117,5 @@ def test_clean_up_while_requests_wait(room_map_file, room_camera, room_queries):
             assert client.spin_until(again.done, TIMEOUT), localizer.output
             assert again.result().success
         client.connect()
-        send_good(client, room_camera, query)
+        send_good(client, room_camera, photo)
         assert "Traceback" not in localizer.output

@@ -25,11 +25,11 @@ def odometry(T_odom_base: np.ndarray, stamp, child: str) -> Odometry:
     return message
 
 
-def test_tracking_goes_on_from_answers_carried_by_odometry(room_map_file, room_camera, room_queries):
+def test_tracking_goes_on_from_answers_carried_by_odometry(room_map_file, room_camera, room_photos):
     """Two photos far apart, one prior: the second is found by the odometry, and without it not."""
     first, second = (
-        room_queries[0],
-        max(room_queries, key=lambda q: np.linalg.norm((invert(room_queries[0].T_map_camera) @ q.T_map_camera)[:3, 3])),
+        room_photos[0],
+        max(room_photos, key=lambda q: np.linalg.norm((invert(room_photos[0].T_map_camera) @ q.T_map_camera)[:3, 3])),
     )
     drift = make_pose(so3_exp(np.array([0.0, 0.02, 0.0])), [0.05, 0.0, 0.0])
     # An answer is believed only near to what it started from.

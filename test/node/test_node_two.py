@@ -139,36 +139,36 @@ def robots(localizers):
         robots.close()
 
 
-def send_inputs(robots: Robots, name: str, camera, query) -> None:
+def send_inputs(robots: Robots, name: str, camera, photo) -> None:
     robots.send(name, "camera_info", info_of(camera))
-    prior = ALIGNMENTS[name].transform_pose(query.T_map_camera_prior)
+    prior = ALIGNMENTS[name].transform_pose(photo.T_map_camera_prior)
     robots.send(name, "prior", prior_of(prior, f"map_{name}"))
     robots.spin(0.3)
 
 
-def image_of(query, second: int) -> Image:
-    image = rgb_image(query.image)
+def image_of(photo, second: int) -> Image:
+    image = rgb_image(photo.image)
     image.header.stamp.sec = second
     return image
 
 
-def assert_right(pose: PoseWithCovarianceStamped, name: str, query) -> None:
+def assert_right(pose: PoseWithCovarianceStamped, name: str, photo) -> None:
     alignment = ALIGNMENTS[name]
-    truth = alignment.transform_pose(query.T_map_camera)
+    truth = alignment.transform_pose(photo.T_map_camera)
     assert pose.header.frame_id == f"map_{name}"
     assert rotation_error_deg(matrix_of(pose), truth) < 1.0
     assert translation_error(matrix_of(pose), truth) < 0.02 * alignment.scale
 
 
-def test_each_answers_its_own_images_from_its_own_map(robots, room_camera, room_queries):
-    queries = dict(zip(ALIGNMENTS, room_queries, strict=False))
-    images = {name: image_of(query, 100 + index) for index, (name, query) in enumerate(queries.items())}
-    for name, query in queries.items():
-        send_inputs(robots, name, room_camera, query)
+def test_each_answers_its_own_images_from_its_own_map(robots, room_camera, room_photos):
+    photos = dict(zip(ALIGNMENTS, room_photos, strict=False))
+    images = {name: image_of(photo, 100 + index) for index, (name, photo) in enumerate(photos.items())}
+    for name, photo in photos.items():
+        send_inputs(robots, name, room_camera, photo)
     for name, image in images.items():
         assert robots.send_image(name, image) == "localized"
-    for name, query in queries.items():
-        assert_right(robots.pose(name, images[name]), name, query)
+    for name, photo in photos.items():
+        assert_right(robots.pose(name, images[name]), name, photo)
     # Nobody else said anything on them, and both say how they are.
     robots.spin(2.0)
     parts = ("localization", "health")
@@ -178,34 +178,34 @@ def test_each_answers_its_own_images_from_its_own_map(robots, room_camera, room_
         assert text(images[name]) not in robots.statuses[f"{other}/localizer: localization"]
 
 
-def test_each_service_is_of_its_own_localizer(robots, room_camera, room_queries):
-    query = room_queries[2]
-    send_inputs(robots, "b", room_camera, query)
-    image = image_of(query, 200)
+def test_each_service_is_of_its_own_localizer(robots, room_camera, room_photos):
+    photo = room_photos[2]
+    send_inputs(robots, "b", room_camera, photo)
+    image = image_of(photo, 200)
     assert robots.send_image("b", image) == "localized"
     robots.pose("b", image)
     robots.poses["b"].clear()
     assert robots.relocalize("b").success
-    assert_right(robots.pose("b", image), "b", query)
+    assert_right(robots.pose("b", image), "b", photo)
     assert text(image) not in robots.poses["a"]
 
 
-def test_a_prior_in_the_frame_of_the_other_map_is_refused(robots, room_camera, room_queries):
-    query = room_queries[3]
-    send_inputs(robots, "a", room_camera, query)
-    robots.send("a", "prior", prior_of(query.T_map_camera_prior, "map_b"))
+def test_a_prior_in_the_frame_of_the_other_map_is_refused(robots, room_camera, room_photos):
+    photo = room_photos[3]
+    send_inputs(robots, "a", room_camera, photo)
+    robots.send("a", "prior", prior_of(photo.T_map_camera_prior, "map_b"))
     robots.spin(0.3)
-    assert robots.send_image("a", image_of(query, 300)) == "refused"
+    assert robots.send_image("a", image_of(photo, 300)) == "refused"
     answer = robots.relocalize("a")
     assert not answer.success
     assert "prior is in frame 'map_b' but the map is in 'map_a'" in answer.message
 
 
-def test_one_ends_and_the_other_goes_on(robots, localizers, room_camera, room_queries):
+def test_one_ends_and_the_other_goes_on(robots, localizers, room_camera, room_photos):
     # The last test: those before need both.
     localizers["a"].end()
-    query = room_queries[4]
-    send_inputs(robots, "b", room_camera, query)
-    image = image_of(query, 400)
+    photo = room_photos[4]
+    send_inputs(robots, "b", room_camera, photo)
+    image = image_of(photo, 400)
     assert robots.send_image("b", image) == "localized"
-    assert_right(robots.pose("b", image), "b", query)
+    assert_right(robots.pose("b", image), "b", photo)

@@ -37,7 +37,7 @@ from gsfeatloc_ros.common.geometry import (
     rotation_error_deg,
     translation_error,
 )
-from gsfeatloc_ros.simulate import Query
+from gsfeatloc_ros.simulate import SimulatedPhoto
 
 # Seconds. Generous: the first start on a machine compiles kernels, and CI machines are slow and shared.
 START_TIMEOUT = 180.0
@@ -411,10 +411,10 @@ def assert_close(message: PoseWithCovarianceStamped, T_map_camera: np.ndarray) -
     assert translation_error(pose, T_map_camera) < 0.02
 
 
-def send_inputs(client: Client, camera: Camera, query: Query) -> None:
-    """The camera_info and the prior with which a query can be answered."""
+def send_inputs(client: Client, camera: Camera, photo: SimulatedPhoto) -> None:
+    """The camera_info and the prior with which a photo can be answered."""
     client.send_camera_info(info_of(camera))
-    client.send_prior(prior_of(query.T_map_camera_prior))
+    client.send_prior(prior_of(photo.T_map_camera_prior))
 
 
 def stamped(message: object, seconds: int) -> object:
@@ -431,17 +431,17 @@ def attempt_at(client: Client, image: Image, seconds: int | None) -> Diagnostic:
     return client.until_diagnosed(lambda: client.send_image(image), lambda d: d.values.get("stamp") == text(image))
 
 
-def assert_answer(client: Client, query: Query, seconds: int | None = None) -> None:
-    """The query's image, with this stamp or a new one, is answered rightly."""
-    image = rgb_image(query.image)
+def assert_answer(client: Client, photo: SimulatedPhoto, seconds: int | None = None) -> None:
+    """The photo, with this stamp or a new one, is answered rightly."""
+    image = rgb_image(photo.image)
     diagnostic = attempt_at(client, image, seconds)
     assert diagnostic.ok, diagnostic
-    assert_close(client.pose_of(image), query.T_map_camera)
+    assert_close(client.pose_of(image), photo.T_map_camera)
 
 
-def assert_no_answer(client: Client, query: Query, says: str, seconds: int | None = None) -> None:
-    """The query's image, with this stamp or a new one, gets no pose, for a reason that matches."""
-    image = rgb_image(query.image)
+def assert_no_answer(client: Client, photo: SimulatedPhoto, says: str, seconds: int | None = None) -> None:
+    """The photo, with this stamp or a new one, gets no pose, for a reason that matches."""
+    image = rgb_image(photo.image)
     diagnostic = attempt_at(client, image, seconds)
     assert not diagnostic.ok
     assert re.search(says, diagnostic.reason), diagnostic

@@ -13,7 +13,7 @@ import numpy as np
 
 from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.geometry import invert
-from gsfeatloc_ros.simulate.photos import Query, Walk
+from gsfeatloc_ros.simulate.photos import SimulatedPhoto, Walk
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # from OpenGL's camera axes to ours
 
@@ -71,26 +71,26 @@ def write_colmap(
     return folder
 
 
-def write_nerfstudio(folder: Path, camera: Camera, queries: Sequence[Query], map_file: Path) -> Path:
-    """Write transforms.json, the photos of `queries`, all of them for testing, and the map.
+def write_nerfstudio(folder: Path, camera: Camera, photos: Sequence[SimulatedPhoto], map_file: Path) -> Path:
+    """Write transforms.json, `photos`, all of them for testing, and the map.
 
     Frames of a lap round the room, without photos, give the trajectory its radius.
     """
     keys = ("fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "p1", "p2", "k3")
     fx, fy, cx, cy = camera.K[[0, 1, 0, 1], [0, 1, 2, 2]]
     values = (fx, fy, cx + 0.5, cy + 0.5, camera.width, camera.height, *camera.distortion)
-    names = [f"images/{index}.png" for index in range(len(queries))]
+    names = [f"images/{index}.png" for index in range(len(photos))]
     frames = [
-        {"file_path": name, "transform_matrix": (query.T_map_camera @ OPENGL).tolist()}
-        for name, query in zip(names, queries, strict=True)
+        {"file_path": name, "transform_matrix": (photo.T_map_camera @ OPENGL).tolist()}
+        for name, photo in zip(names, photos, strict=True)
     ]
     lap = [Walk(np.zeros(4)).pose(time) for time in range(0, 30, 3)]
     frames += [
         {"file_path": f"images/lap{index}.png", "transform_matrix": (pose @ OPENGL).tolist()}
         for index, pose in enumerate(lap)
     ]
-    for name, query in zip(names, queries, strict=True):
-        save_image(folder / name, query.image)
+    for name, photo in zip(names, photos, strict=True):
+        save_image(folder / name, photo.image)
     transforms = {**dict(zip(keys, values, strict=True)), "frames": frames, "test_filenames": names}
     (folder / "transforms.json").write_text(json.dumps(transforms), encoding="utf-8")
     shutil.copy(map_file, folder / "map.ply")

@@ -20,7 +20,7 @@ from gsfeatloc_ros.benchmark.scaling import draw_scaling, measure_scaling
 from gsfeatloc_ros.common.geometry import invert, quaternion_from_matrix, transform
 from gsfeatloc_ros.maps import load_map
 from gsfeatloc_ros.render import create_renderer
-from gsfeatloc_ros.simulate import simulate_queries
+from gsfeatloc_ros.simulate import simulate_photos
 from gsfeatloc_ros.simulate.two_rooms import VIEWS, two_rooms
 from gsfeatloc_ros.tools import benchmark
 
@@ -35,8 +35,8 @@ def map_file(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory, room, room_camera, room_map_file) -> Path:
     camera = room_camera.scaled(320, 240)
-    queries = simulate_queries(room, camera, count=2, seed=5)
-    return write_nerfstudio(tmp_path_factory.mktemp("room"), camera, queries, room_map_file)
+    photos = simulate_photos(room, camera, count=2, seed=5)
+    return write_nerfstudio(tmp_path_factory.mktemp("room"), camera, photos, room_map_file)
 
 
 def measured(tmp_path: Path, *arguments: object) -> dict:

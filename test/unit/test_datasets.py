@@ -19,7 +19,7 @@ from gsfeatloc_ros.localize.localizer import Localizer
 from gsfeatloc_ros.maps import load_map
 from gsfeatloc_ros.match import create_matcher
 from gsfeatloc_ros.render import create_renderer
-from gsfeatloc_ros.simulate import simulate_queries
+from gsfeatloc_ros.simulate import simulate_photos
 
 # nerfstudio
 
@@ -186,8 +186,8 @@ def small_camera(room_camera):
 
 
 @pytest.fixture(scope="module")
-def small_queries(room, small_camera):
-    return simulate_queries(room, small_camera, count=9, seed=3)
+def small_photos(room, small_camera):
+    return simulate_photos(room, small_camera, count=9, seed=3)
 
 
 @pytest.fixture(scope="module")
@@ -204,9 +204,9 @@ def assert_localizes(localizer, scene, index, prior):
     assert translation_error(estimate.T_map_camera, photo.T_map_camera) < 0.03
 
 
-def test_nerf_synthetic(tmp_path, room, room_map_file, small_camera, small_queries, localizer):
+def test_nerf_synthetic(tmp_path, room, room_map_file, small_camera, small_photos, localizer):
     camera = Camera(320, 240, np.array([[260.0, 0, 159.5], [0, 260.0, 119.5], [0, 0, 1]]))
-    poses = [query.T_map_camera for query in small_queries]
+    poses = [simulated.T_map_camera for simulated in small_photos]
     photo = np.full((240, 320, 4), 255, np.uint8)
     photo[..., :3] = np.rint(255 * room.trace(camera, poses[7]).rgb)
     photo[:30, :40, 3] = 0
@@ -223,7 +223,7 @@ def test_nerf_synthetic(tmp_path, room, room_map_file, small_camera, small_queri
     pixels = scene.read_photo(scene.photos[0])
     assert (pixels[:30, :40] == 255).all()
     np.testing.assert_array_equal(pixels[30:], photo[30:, :, :3])
-    assert_localizes(localizer, scene, 0, small_queries[7].T_map_camera_prior)
+    assert_localizes(localizer, scene, 0, small_photos[7].T_map_camera_prior)
 
 
 def test_nerf_synthetic_without_other_splits(tmp_path):
@@ -258,24 +258,24 @@ def test_nerf_synthetic_that_cannot_be_used(tmp_path, change, message):
 
 
 @pytest.mark.parametrize("text", [False, True])
-def test_colmap(tmp_path, room_map_file, small_camera, small_queries, localizer, text):
+def test_colmap(tmp_path, room_map_file, small_camera, small_photos, localizer, text):
     model, parameters = colmap_camera(small_camera)
     # Written in another order than that of the names, which decides.
-    images = [(f"walk/{9 - index}.png", 0, query.T_map_camera) for index, query in enumerate(small_queries)]
+    images = [(f"walk/{9 - index}.png", 0, simulated.T_map_camera) for index, simulated in enumerate(small_photos)]
     write_colmap(tmp_path, [(model, 320, 240, parameters)], images, text)
     shutil.copy(room_map_file, tmp_path / "point_cloud.ply")
-    tested = [small_queries[8], small_queries[0]]
-    for name, query in zip(("1", "9"), tested, strict=True):
-        save_image(tmp_path / f"images/walk/{name}.png", query.image)
+    tested = [small_photos[8], small_photos[0]]
+    for name, simulated in zip(("1", "9"), tested, strict=True):
+        save_image(tmp_path / f"images/walk/{name}.png", simulated.image)
     scene = load_scene(tmp_path)
     assert [photo.name for photo in scene.photos] == ["1.png", "9.png"]
     np.testing.assert_allclose(scene.camera.K, small_camera.K, atol=1e-6)
     np.testing.assert_allclose(scene.camera.distortion, small_camera.distortion[:4], atol=1e-6)
-    for photo, query in zip(scene.photos, tested, strict=True):
-        np.testing.assert_allclose(photo.T_map_camera, query.T_map_camera, atol=1e-6)
-    np.testing.assert_allclose(scene.trajectory, [query.T_map_camera for query in small_queries[::-1]], atol=1e-6)
-    for index, query in enumerate(tested):
-        assert_localizes(localizer, scene, index, query.T_map_camera_prior)
+    for photo, simulated in zip(scene.photos, tested, strict=True):
+        np.testing.assert_allclose(photo.T_map_camera, simulated.T_map_camera, atol=1e-6)
+    np.testing.assert_allclose(scene.trajectory, [each.T_map_camera for each in small_photos[::-1]], atol=1e-6)
+    for index, simulated in enumerate(tested):
+        assert_localizes(localizer, scene, index, simulated.T_map_camera_prior)
 
 
 @pytest.mark.parametrize(

@@ -162,13 +162,13 @@ def test_the_photo_is_not_drawn_on():
     assert (estimate.last_render.rgb == 0.25).all()
 
 
-def test_a_localized_photo_of_the_room(room_map, room_camera, room_queries):
-    query = room_queries[0]
+def test_a_localized_photo_of_the_room(room_map, room_camera, room_photos):
+    simulated = room_photos[0]
     estimate = Localizer(create_renderer(room_map), create_matcher("sift")).localize(
-        query.image, room_camera, query.T_map_camera_prior
+        simulated.image, room_camera, simulated.T_map_camera_prior
     )
     assert estimate.localized
-    photo = Photo.undistorted(query.image, room_camera, 640).image
+    photo = Photo.undistorted(simulated.image, room_camera, 640).image
     picture = draw(photo, estimate)
     _, green, _ = badge(picture)
     assert green > 100

@@ -522,29 +522,29 @@ def test_a_piece_is_back_afterwards(piece):
 
 
 @pytest.mark.parametrize("piece", PIECES)
-def test_every_piece_makes_a_difference(piece, room_map, room_camera, room_queries):
-    query, matcher = room_queries[0], create_matcher("sift")
+def test_every_piece_makes_a_difference(piece, room_map, room_camera, room_photos):
+    photo, matcher = room_photos[0], create_matcher("sift")
     renderer = create_renderer(room_map)
     options = LocalizerOptions(min_inlier_ratio=0.3, max_passes=1)
 
     def answer(taken_out):
         used = MeanDepthRenderer(renderer) if taken_out == "median-depth" else renderer
         with without(taken_out, matcher):
-            return Localizer(used, matcher, options).localize(query.image, room_camera, query.T_map_camera_prior)
+            return Localizer(used, matcher, options).localize(photo.image, room_camera, photo.T_map_camera_prior)
 
     whole, part = answer(""), answer(piece)
     assert whole.localized
     assert part.localized, part.reason
     assert not np.array_equal(whole.T_map_camera, part.T_map_camera)
-    assert translation_error(part.T_map_camera, query.T_map_camera) < 0.05
+    assert translation_error(part.T_map_camera, photo.T_map_camera) < 0.05
 
 
 # Spoilt photos
 
 
 @pytest.mark.parametrize("name", SPOILERS)
-def test_spoilt_photos_are_of_the_same_size_and_worse(name, room_queries):
-    image = room_queries[0].image
+def test_spoilt_photos_are_of_the_same_size_and_worse(name, room_photos):
+    image = room_photos[0].image
     kept = image.copy()
     spoilt = SPOILERS[name](image)
     np.testing.assert_array_equal(image, kept)

@@ -15,7 +15,7 @@ from gsfeatloc_ros.evaluate.scene import load_scene
 from gsfeatloc_ros.localize.localizer import LocalizerOptions
 from gsfeatloc_ros.maps import load_map
 from gsfeatloc_ros.maps.ply import write_ply
-from gsfeatloc_ros.simulate import simulate_queries
+from gsfeatloc_ros.simulate import simulate_photos
 from gsfeatloc_ros.tools.evaluate import main
 
 # The room is small for the paper's priors: a lesser sigma keeps them out of the walls.
@@ -23,15 +23,15 @@ QUICK = ["--matcher", "sift", "--sigma", "0.3"]
 
 
 @pytest.fixture(scope="module")
-def queries(room, room_camera):
-    return simulate_queries(room, room_camera.scaled(320, 240), count=4, seed=5)
+def photos(room, room_camera):
+    return simulate_photos(room, room_camera.scaled(320, 240), count=4, seed=5)
 
 
 @pytest.fixture
-def room_scene(tmp_path, room_camera, queries, room_map_file):
+def room_scene(tmp_path, room_camera, photos, room_map_file):
     folder = tmp_path / "room"
     folder.mkdir()
-    return write_nerfstudio(folder, room_camera.scaled(320, 240), queries, room_map_file)
+    return write_nerfstudio(folder, room_camera.scaled(320, 240), photos, room_map_file)
 
 
 def read(path):
@@ -86,9 +86,9 @@ def test_sweep_is_reported_by_step(room_scene, tmp_path, capsys):
     assert capsys.readouterr().out.count("prior off by") == 11
 
 
-def test_priors_of_another_system(room_scene, queries, tmp_path):
+def test_priors_of_another_system(room_scene, photos, tmp_path):
     path = tmp_path / "report.json"
-    prior = queries[2].T_map_camera_prior
+    prior = photos[2].T_map_camera_prior
     numbers = [*prior[:3, 3], *quaternion_from_matrix(prior[:3, :3])]
     (tmp_path / "odometry.txt").write_text(f"2 {' '.join(map(str, numbers))}\n")
     options = ["--protocol", "priors-file", "--priors", str(tmp_path / "odometry.txt")]

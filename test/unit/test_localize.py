@@ -30,17 +30,17 @@ def sift_localizer(renderer):
     return Localizer(renderer, create_matcher("sift"))
 
 
-def test_finds_the_camera_within_a_degree_and_two_centimetres(localizer, room_camera, room_queries) -> None:
-    for query in room_queries[:4]:
-        estimate = localizer.localize(query.image, room_camera, query.T_map_camera_prior)
+def test_finds_the_camera_within_a_degree_and_two_centimetres(localizer, room_camera, room_photos) -> None:
+    for photo in room_photos[:4]:
+        estimate = localizer.localize(photo.image, room_camera, photo.T_map_camera_prior)
         assert estimate.status is Status.LOCALIZED, estimate.reason
-        assert rotation_error_deg(estimate.T_map_camera, query.T_map_camera) < 1.0
-        assert translation_error(estimate.T_map_camera, query.T_map_camera) < 0.02
+        assert rotation_error_deg(estimate.T_map_camera, photo.T_map_camera) < 1.0
+        assert translation_error(estimate.T_map_camera, photo.T_map_camera) < 0.02
 
 
-def test_the_answer_carries_its_evidence(sift_localizer, room_camera, room_queries) -> None:
-    query = room_queries[0]
-    estimate = sift_localizer.localize(query.image, room_camera, query.T_map_camera_prior)
+def test_the_answer_carries_its_evidence(sift_localizer, room_camera, room_photos) -> None:
+    photo = room_photos[0]
+    estimate = sift_localizer.localize(photo.image, room_camera, photo.T_map_camera_prior)
     np.testing.assert_allclose(estimate.covariance, estimate.covariance.T, rtol=1e-6)
     assert np.linalg.eigvalsh(estimate.covariance)[0] > 0
     assert 20 <= estimate.inliers <= estimate.matches
@@ -63,19 +63,19 @@ def test_the_answer_carries_its_evidence(sift_localizer, room_camera, room_queri
     assert stages <= estimate.milliseconds["total"]
 
 
-def test_the_same_seed_gives_the_same_answer(sift_localizer, room_camera, room_queries) -> None:
-    query = room_queries[1]
-    a, b = (sift_localizer.localize(query.image, room_camera, query.T_map_camera_prior) for _ in range(2))
+def test_the_same_seed_gives_the_same_answer(sift_localizer, room_camera, room_photos) -> None:
+    photo = room_photos[1]
+    a, b = (sift_localizer.localize(photo.image, room_camera, photo.T_map_camera_prior) for _ in range(2))
     np.testing.assert_array_equal(a.T_map_camera, b.T_map_camera)
 
 
-def test_wide_photos_are_resized(renderer, room_camera, room_queries) -> None:
+def test_wide_photos_are_resized(renderer, room_camera, room_photos) -> None:
     narrow = Localizer(renderer, create_matcher("sift"), LocalizerOptions(max_image_width=480))
-    query = room_queries[2]
-    estimate = narrow.localize(query.image, room_camera, query.T_map_camera_prior)
+    photo = room_photos[2]
+    estimate = narrow.localize(photo.image, room_camera, photo.T_map_camera_prior)
     assert estimate.last_render.rgb.shape == (360, 480, 3)
-    assert rotation_error_deg(estimate.T_map_camera, query.T_map_camera) < 1.0
-    assert translation_error(estimate.T_map_camera, query.T_map_camera) < 0.03
+    assert rotation_error_deg(estimate.T_map_camera, photo.T_map_camera) < 1.0
+    assert translation_error(estimate.T_map_camera, photo.T_map_camera) < 0.03
 
 
 def assert_no_answer(estimate) -> None:
@@ -87,42 +87,42 @@ def assert_no_answer(estimate) -> None:
 
 
 @pytest.mark.parametrize("value", [0, 128, 255], ids=["black", "grey", "white"])
-def test_a_photo_of_nothing_is_a_failure_with_a_reason(localizer, room_camera, room_queries, value: int) -> None:
+def test_a_photo_of_nothing_is_a_failure_with_a_reason(localizer, room_camera, room_photos, value: int) -> None:
     nothing = np.full((room_camera.height, room_camera.width, 3), value, np.uint8)
-    estimate = localizer.localize(nothing, room_camera, room_queries[0].T_map_camera)
+    estimate = localizer.localize(nothing, room_camera, room_photos[0].T_map_camera)
     assert_no_answer(estimate)
     assert "0 features" in estimate.reason
 
 
-def test_a_prior_that_sees_nothing_is_a_failure(localizer, room_camera, room_queries) -> None:
+def test_a_prior_that_sees_nothing_is_a_failure(localizer, room_camera, room_photos) -> None:
     outside = make_pose(np.eye(3), np.array([0, 0, 1000.0]))
-    assert_no_answer(localizer.localize(room_queries[0].image, room_camera, outside))
+    assert_no_answer(localizer.localize(room_photos[0].image, room_camera, outside))
 
 
-def test_noise_is_no_place(localizer, room_camera, room_queries) -> None:
-    noise = np.random.default_rng(0).integers(0, 256, room_queries[0].image.shape, dtype=np.uint8)
-    assert_no_answer(localizer.localize(noise, room_camera, room_queries[0].T_map_camera))
+def test_noise_is_no_place(localizer, room_camera, room_photos) -> None:
+    noise = np.random.default_rng(0).integers(0, 256, room_photos[0].image.shape, dtype=np.uint8)
+    assert_no_answer(localizer.localize(noise, room_camera, room_photos[0].T_map_camera))
 
 
-def test_mirrored_photos_are_rejected(localizer, room_camera, room_queries) -> None:
+def test_mirrored_photos_are_rejected(localizer, room_camera, room_photos) -> None:
     """Seen from behind, through the wall, the room is mirrored: poses there match well, but are far from the prior."""
-    for query in room_queries[:2]:
-        mirrored = np.ascontiguousarray(query.image[:, ::-1])
-        assert_no_answer(localizer.localize(mirrored, room_camera, query.T_map_camera))
+    for photo in room_photos[:2]:
+        mirrored = np.ascontiguousarray(photo.image[:, ::-1])
+        assert_no_answer(localizer.localize(mirrored, room_camera, photo.T_map_camera))
 
 
-def test_an_answer_far_from_the_prior_is_rejected(sift_localizer, room_camera, room_queries) -> None:
+def test_an_answer_far_from_the_prior_is_rejected(sift_localizer, room_camera, room_photos) -> None:
     """The prior is 0.3 m and 10 degrees off at least, and says that it knows better."""
-    query = room_queries[0]
+    photo = room_photos[0]
     sure = np.diag([1e-6] * 6)
-    estimate = sift_localizer.localize(query.image, room_camera, query.T_map_camera_prior, sure)
+    estimate = sift_localizer.localize(photo.image, room_camera, photo.T_map_camera_prior, sure)
     assert estimate.status is Status.REJECTED
     assert "standard deviations from the prior" in estimate.reason
 
 
-def test_the_render_at_the_estimate_is_the_judge(renderer, room_camera, room_queries) -> None:
+def test_the_render_at_the_estimate_is_the_judge(renderer, room_camera, room_photos) -> None:
     """What it is asked for and does not have is said; the pose is kept back."""
-    query = room_queries[0]
+    photo = room_photos[0]
     demands = {
         "min_inliers": (100_000, "at least 100000 needed"),
         "min_inlier_ratio": (1.0, "inliers"),
@@ -131,21 +131,21 @@ def test_the_render_at_the_estimate_is_the_judge(renderer, room_camera, room_que
     }
     for option, (value, says) in demands.items():
         demanding = Localizer(renderer, create_matcher("sift"), LocalizerOptions(max_views=0, **{option: value}))
-        estimate = demanding.localize(query.image, room_camera, query.T_map_camera_prior)
+        estimate = demanding.localize(photo.image, room_camera, photo.T_map_camera_prior)
         assert estimate.status is Status.REJECTED
         assert_no_answer(estimate)
         assert says in estimate.reason
         assert estimate.passes >= 1
 
 
-def test_distortion_is_taken_out(sift_localizer, room_camera, room_queries) -> None:
+def test_distortion_is_taken_out(sift_localizer, room_camera, room_photos) -> None:
     """Without the distortion coefficients the same photo gives a clearly worse pose, or none."""
-    query = room_queries[0]
+    photo = room_photos[0]
     pinhole = replace(room_camera, distortion=np.zeros(5))
-    good = sift_localizer.localize(query.image, room_camera, query.T_map_camera_prior)
-    bad = sift_localizer.localize(query.image, pinhole, query.T_map_camera_prior)
-    error = translation_error(good.T_map_camera, query.T_map_camera)
-    assert not bad.localized or translation_error(bad.T_map_camera, query.T_map_camera) > 2 * error
+    good = sift_localizer.localize(photo.image, room_camera, photo.T_map_camera_prior)
+    bad = sift_localizer.localize(photo.image, pinhole, photo.T_map_camera_prior)
+    error = translation_error(good.T_map_camera, photo.T_map_camera)
+    assert not bad.localized or translation_error(bad.T_map_camera, photo.T_map_camera) > 2 * error
 
 
 @pytest.mark.parametrize(
@@ -160,15 +160,15 @@ def test_refuses_images_of_another_kind(sift_localizer, image) -> None:
 
 
 @pytest.mark.parametrize("prior", [np.full((4, 4), np.nan), np.eye(3)], ids=["NaN", "3x3"])
-def test_refuses_priors_that_are_no_pose(sift_localizer, room_camera, room_queries, prior) -> None:
+def test_refuses_priors_that_are_no_pose(sift_localizer, room_camera, room_photos, prior) -> None:
     with pytest.raises(ValueError, match="prior"):
-        sift_localizer.localize(room_queries[0].image, room_camera, prior)
+        sift_localizer.localize(room_photos[0].image, room_camera, prior)
 
 
-def test_a_perfect_prior_is_confirmed(sift_localizer, room_camera, room_queries) -> None:
-    query = room_queries[3]
+def test_a_perfect_prior_is_confirmed(sift_localizer, room_camera, room_photos) -> None:
+    photo = room_photos[3]
     estimate = sift_localizer.localize(
-        query.image, room_camera, query.T_map_camera @ make_pose(so3_exp(np.zeros(3)), [0, 0, 0])
+        photo.image, room_camera, photo.T_map_camera @ make_pose(so3_exp(np.zeros(3)), [0, 0, 0])
     )
     assert estimate.localized
-    assert translation_error(estimate.T_map_camera, query.T_map_camera) < 0.02
+    assert translation_error(estimate.T_map_camera, photo.T_map_camera) < 0.02

@@ -141,17 +141,17 @@ def test_the_robots_own_frame_changes_nothing():
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_answers_are_in_the_robots_frame(room_map, room_camera, room_queries, seed):
+def test_answers_are_in_the_robots_frame(room_map, room_camera, room_photos, seed):
     S_map_splat = random_similarity(seed)
     here = Localizer(create_renderer(room_map), create_matcher("sift"))
     elsewhere = Localizer(create_renderer(trained_elsewhere(room_map, S_map_splat)), create_matcher("sift"))
-    for query in room_queries[:2]:
-        a, b = (x.localize(query.image, room_camera, query.T_map_camera_prior) for x in (here, elsewhere))
+    for photo in room_photos[:2]:
+        a, b = (x.localize(photo.image, room_camera, photo.T_map_camera_prior) for x in (here, elsewhere))
         assert a.status is b.status is Status.LOCALIZED
         assert rotation_error_deg(a.T_map_camera, b.T_map_camera) < 0.1
         assert translation_error(a.T_map_camera, b.T_map_camera) < 0.005
-        assert rotation_error_deg(b.T_map_camera, query.T_map_camera) < 1.0
-        assert translation_error(b.T_map_camera, query.T_map_camera) < 0.02
+        assert rotation_error_deg(b.T_map_camera, photo.T_map_camera) < 1.0
+        assert translation_error(b.T_map_camera, photo.T_map_camera) < 0.02
         np.testing.assert_allclose(np.diag(b.covariance), np.diag(a.covariance), rtol=0.3)
 
 

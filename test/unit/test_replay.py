@@ -128,14 +128,14 @@ def write(path: Path, messages: list, storage: StoragePlugin = StoragePlugin.MCA
     return path
 
 
-def recording(query, camera, *, stamp: float | None = None) -> list:
-    """The messages of a query, in the order of write_bag."""
-    stamp = query.stamp if stamp is None else stamp
+def recording(photo, camera, *, stamp: float | None = None) -> list:
+    """The messages of a photo, in the order of write_bag."""
+    stamp = photo.stamp if stamp is None else stamp
     return [
-        (TOPICS["prior"], pose_stamped(stamp - 0.01, query.T_map_camera_prior)),
+        (TOPICS["prior"], pose_stamped(stamp - 0.01, photo.T_map_camera_prior)),
         (TOPICS["camera_info"], camera_info(stamp, camera)),
-        (TOPICS["image"], image(stamp, query.image)),
-        (TRUTH, pose_stamped(stamp, query.T_map_camera)),
+        (TOPICS["image"], image(stamp, photo.image)),
+        (TRUTH, pose_stamped(stamp, photo.T_map_camera)),
     ]
 
 
@@ -164,9 +164,9 @@ def distance(pose: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
 
 
 @storages
-def test_outputs_of_a_bag(storage, room_camera, room_queries, room_map_file, tmp_path, capsys):
-    queries, out = room_queries[:3], tmp_path / "new" / "out"
-    write_bag(tmp_path / "bag", room_camera, queries, storage)
+def test_outputs_of_a_bag(storage, room_camera, room_photos, room_map_file, tmp_path, capsys):
+    photos, out = room_photos[:3], tmp_path / "new" / "out"
+    write_bag(tmp_path / "bag", room_camera, photos, storage)
     assert main(arguments(tmp_path / "bag", room_map_file, out)) == 0
     said = capsys.readouterr().out
     assert "localized 3 of 3 images" in said
@@ -175,9 +175,9 @@ def test_outputs_of_a_bag(storage, room_camera, room_queries, room_map_file, tmp
     tum, rows = np.loadtxt(out / "answers.tum"), rows_of(out)
     assert tum.shape == (3, 8)
     assert [row["status"] for row in rows] == ["localized"] * 3
-    for query, line, row in zip(queries, tum, rows, strict=True):
-        assert line[0] == float(row["stamp"]) == float(row["bag_time"]) == query.stamp
-        rotation, translation = distance(line[1:], query.T_map_camera)
+    for photo, line, row in zip(photos, tum, rows, strict=True):
+        assert line[0] == float(row["stamp"]) == float(row["bag_time"]) == photo.stamp
+        rotation, translation = distance(line[1:], photo.T_map_camera)
         assert rotation < 1
         assert translation < 0.02
         assert float(row["rotation_error_deg"]) == pytest.approx(rotation, abs=2e-3)
@@ -194,8 +194,8 @@ def test_outputs_of_a_bag(storage, room_camera, room_queries, room_map_file, tmp
             ("/pose", "geometry_msgs/msg/PoseWithCovarianceStamped")
         }
         answers = [(time, reader.deserialize(cdr, c.msgtype)) for c, time, cdr in reader.messages()]
-    for query, line, row, (time, message) in zip(queries, tum, rows, answers, strict=True):
-        assert (message.header.stamp.sec, message.header.frame_id, time) == (query.stamp, "map", 1e9 * query.stamp)
+    for photo, line, row, (time, message) in zip(photos, tum, rows, answers, strict=True):
+        assert (message.header.stamp.sec, message.header.frame_id, time) == (photo.stamp, "map", 1e9 * photo.stamp)
         p, q = message.pose.pose.position, message.pose.pose.orientation
         assert [p.x, p.y, p.z, q.x, q.y, q.z, q.w] == pytest.approx(line[1:], abs=1e-8)
         variances = [float(row[f"var_{name}"]) for name in ("x", "y", "z", "rx", "ry", "rz")]
@@ -204,15 +204,15 @@ def test_outputs_of_a_bag(storage, room_camera, room_queries, room_map_file, tmp
     assert picture.std() > 10
 
 
-def test_answers_are_those_of_the_localizer(room_camera, room_queries, room_map_file, tmp_path):
-    write_bag(tmp_path / "bag", room_camera, room_queries[:2])
+def test_answers_are_those_of_the_localizer(room_camera, room_photos, room_map_file, tmp_path):
+    write_bag(tmp_path / "bag", room_camera, room_photos[:2])
     assert main(arguments(tmp_path / "bag", room_map_file, tmp_path / "out", "--set", "max_passes=2", truth=False)) == 0
     renderer, matcher = create_renderer(load_map(room_map_file)), create_matcher("sift")
     localizer = Localizer(renderer, matcher, LocalizerOptions(max_passes=2))
-    for query, line, row in zip(
-        room_queries, np.loadtxt(tmp_path / "out" / "answers.tum"), rows_of(tmp_path / "out"), strict=False
+    for photo, line, row in zip(
+        room_photos, np.loadtxt(tmp_path / "out" / "answers.tum"), rows_of(tmp_path / "out"), strict=False
     ):
-        estimate = localizer.localize(query.image, room_camera, query.T_map_camera_prior)
+        estimate = localizer.localize(photo.image, room_camera, photo.T_map_camera_prior)
         assert row["reason"] == estimate.reason
         assert line[1:4] == pytest.approx(estimate.T_map_camera[:3, 3], abs=1e-8)
         assert rotated(line[4:]) == pytest.approx(estimate.T_map_camera[:3, :3], abs=1e-7)
@@ -220,9 +220,9 @@ def test_answers_are_those_of_the_localizer(room_camera, room_queries, room_map_
     assert not (tmp_path / "out" / "errors.png").exists()
 
 
-def test_answers_are_those_of_the_node(room_camera, room_queries, room_map_file, tmp_path):
+def test_answers_are_those_of_the_node(room_camera, room_photos, room_map_file, tmp_path):
     """Also where an image comes before its camera_info, and where an unusable prior took the place of a good one."""
-    first, second, third, fourth = room_queries[:4]
+    first, second, third, fourth = room_photos[:4]
     elsewhere = pose_stamped(fourth.stamp - 0.02, fourth.T_map_camera_prior, "odom")
     messages = [
         *recording(first, room_camera)[:1],
@@ -251,17 +251,17 @@ def test_answers_are_those_of_the_node(room_camera, room_queries, room_map_file,
             assert rotated(pose[3:]) == pytest.approx(answer.T_map_camera[:3, :3], abs=1e-12)
 
 
-def test_other_types_of_messages(room_camera, room_queries, room_map_file, tmp_path, capsys):
-    query = room_queries[0]
+def test_other_types_of_messages(room_camera, room_photos, room_map_file, tmp_path, capsys):
+    photo = room_photos[0]
     step = make_pose(so3_exp(np.array([0.0, 0.0, 0.1])), [0.02, 0.0, 0.0])
     messages = [
-        (TOPICS["prior"], pose_with_covariance(1.0, query.T_map_camera_prior, np.diag([0.3] * 6))),
+        (TOPICS["prior"], pose_with_covariance(1.0, photo.T_map_camera_prior, np.diag([0.3] * 6))),
         (TOPICS["camera_info"], camera_info(1.0, room_camera)),
-        (TOPICS["image"], compressed_image(100.0, query.image, ".jpg", "rgb8; jpeg compressed bgr8")),
-        (TOPICS["image"], compressed_image(101.0, query.image, ".png", "png")),
+        (TOPICS["image"], compressed_image(100.0, photo.image, ".jpg", "rgb8; jpeg compressed bgr8")),
+        (TOPICS["image"], compressed_image(101.0, photo.image, ".png", "png")),
         # The truth of the first image is half way between two; that of the second is not known.
-        (TRUTH, odometry(100.1, query.T_map_camera @ step)),
-        (TRUTH, odometry(99.9, query.T_map_camera @ np.linalg.inv(step))),
+        (TRUTH, odometry(100.1, photo.T_map_camera @ step)),
+        (TRUTH, odometry(99.9, photo.T_map_camera @ np.linalg.inv(step))),
     ]
     # The prior is a hundred seconds older than the images.
     bag, limit = write(tmp_path / "bag", messages), ("--prior-max-age", "0")
@@ -274,8 +274,8 @@ def test_other_types_of_messages(room_camera, room_queries, room_map_file, tmp_p
     assert "truth known for 1 of the 2 answers" in capsys.readouterr().out
 
 
-def test_the_command_needs_no_ros(room_camera, room_queries, room_map_file, tmp_path):
-    write_bag(tmp_path / "bag", room_camera, room_queries[:1])
+def test_the_command_needs_no_ros(room_camera, room_photos, room_map_file, tmp_path):
+    write_bag(tmp_path / "bag", room_camera, room_photos[:1])
     hide = "import sys; sys.modules.update(dict.fromkeys(['rclpy', 'sensor_msgs', 'geometry_msgs']));"
     code = f"{hide} from gsfeatloc_ros.tools.replay import main; sys.exit(main(sys.argv[1:]))"
     command = [sys.executable, "-c", code, *arguments(tmp_path / "bag", room_map_file, tmp_path / "out")]
@@ -351,11 +351,11 @@ def localizer(room_map):
     return Localizer(create_renderer(room_map), create_matcher("sift"))
 
 
-def test_images_that_cannot_be_used_are_lines(room_camera, room_queries, room_map_file, tmp_path, capsys):
-    query = room_queries[0]
+def test_images_that_cannot_be_used_are_lines(room_camera, room_photos, room_map_file, tmp_path, capsys):
+    photo = room_photos[0]
     messages = [
-        (TOPICS["image"], image(1.0, query.image)),
-        *recording(query, room_camera),
+        (TOPICS["image"], image(1.0, photo.image)),
+        *recording(photo, room_camera),
         (TOPICS["image"], image(2.0, SMALL)),
         (TOPICS["image"], ("sensor_msgs/msg/Image", b"\x00\x01\x00\x00\xff")),
         (TRUTH, ("geometry_msgs/msg/PoseStamped", b"\x00\x01\x00\x00\xff")),
@@ -374,9 +374,9 @@ def test_images_that_cannot_be_used_are_lines(room_camera, room_queries, room_ma
 
 
 def test_an_exception_is_a_line_and_an_interruption_keeps_what_came_before(
-    room_camera, room_queries, room_map_file, tmp_path, monkeypatch, capsys
+    room_camera, room_photos, room_map_file, tmp_path, monkeypatch, capsys
 ):
-    write_bag(tmp_path / "bag", room_camera, room_queries[:3])
+    write_bag(tmp_path / "bag", room_camera, room_photos[:3])
     raised = iter([MemoryError("no room"), None, KeyboardInterrupt()])
     localize = Localizer.localize
 
@@ -433,15 +433,15 @@ def refused(capsys, arguments: list[str]) -> str:
         ("--map-scale", "-1", "scale -1.0 is not a positive number"),
     ],
 )
-def test_options_that_cannot_be_used(room_camera, room_queries, room_map_file, tmp_path, capsys, option, topic, says):
-    write_bag(tmp_path / "bag", room_camera, room_queries[:1])
+def test_options_that_cannot_be_used(room_camera, room_photos, room_map_file, tmp_path, capsys, option, topic, says):
+    write_bag(tmp_path / "bag", room_camera, room_photos[:1])
     options = arguments(tmp_path / "bag", room_map_file, tmp_path / "out", option, *topic.split())
     assert says in refused(capsys, options)
     assert not (tmp_path / "out").exists()
 
 
 @storages
-def test_bags_that_cannot_be_used(storage, room_camera, room_queries, room_map_file, tmp_path, capsys):
+def test_bags_that_cannot_be_used(storage, room_camera, room_photos, room_map_file, tmp_path, capsys):
     def says(bag: Path) -> str:
         return refused(capsys, arguments(bag, room_map_file, tmp_path / "out", truth=False))
 
@@ -459,7 +459,7 @@ def test_bags_that_cannot_be_used(storage, room_camera, room_queries, room_map_f
     }
     assert "has no message on /camera/image_raw" in says(write(tmp_path / "quiet", [], storage, quiet))
 
-    write_bag(tmp_path / "bag", room_camera, room_queries[:2], storage)
+    write_bag(tmp_path / "bag", room_camera, room_photos[:2], storage)
     (file,) = (tmp_path / "bag").glob("bag.*")
     whole = file.read_bytes()
     for size in (0, 5, len(whole) // 2):
@@ -468,8 +468,8 @@ def test_bags_that_cannot_be_used(storage, room_camera, room_queries, room_map_f
     assert not (tmp_path / "out").exists()
 
 
-def test_what_comes_before_a_damage_is_kept(room_camera, room_queries, room_map_file, tmp_path, capsys):
-    write_bag(tmp_path / "bag", room_camera, room_queries[:4], StoragePlugin.SQLITE3)
+def test_what_comes_before_a_damage_is_kept(room_camera, room_photos, room_map_file, tmp_path, capsys):
+    write_bag(tmp_path / "bag", room_camera, room_photos[:4], StoragePlugin.SQLITE3)
     file = tmp_path / "bag" / "bag.db3"
     whole = file.read_bytes()
     middle = len(whole) // 2
@@ -484,8 +484,8 @@ def test_what_comes_before_a_damage_is_kept(room_camera, room_queries, room_map_
     assert len(np.loadtxt(tmp_path / "out" / "answers.tum", ndmin=2)) == len(rows)
 
 
-def test_the_folder_of_the_results_must_be_empty(room_camera, room_queries, room_map_file, tmp_path, capsys):
-    write_bag(tmp_path / "bag", room_camera, room_queries[:1])
+def test_the_folder_of_the_results_must_be_empty(room_camera, room_photos, room_map_file, tmp_path, capsys):
+    write_bag(tmp_path / "bag", room_camera, room_photos[:1])
     said = refused(capsys, arguments(tmp_path / "bag", room_map_file, tmp_path))
     assert "is there already: name a new or an empty folder" in said
 

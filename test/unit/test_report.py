@@ -23,7 +23,7 @@ from gsfeatloc_ros.evaluate.run import Run, Task, draw_priors, localize
 from gsfeatloc_ros.evaluate.scene import load_scene
 from gsfeatloc_ros.evaluate.tables import Group, RunResults, over_seeds
 from gsfeatloc_ros.match import Matches
-from gsfeatloc_ros.simulate import simulate_queries
+from gsfeatloc_ros.simulate import simulate_photos
 from gsfeatloc_ros.tools.evaluate import main
 
 
@@ -60,9 +60,9 @@ def page(tmp_path_factory, room, room_camera, room_map_file):
     folder = tmp_path_factory.mktemp("page") / "bonsai"
     folder.mkdir()
     camera = room_camera.scaled(320, 240)
-    queries = simulate_queries(room, camera, count=2, seed=5)
-    black = replace(queries[1], image=np.zeros_like(queries[1].image))
-    write_nerfstudio(folder, camera, [queries[0], black], room_map_file)
+    photos = simulate_photos(room, camera, count=2, seed=5)
+    black = replace(photos[1], image=np.zeros_like(photos[1].image))
+    write_nerfstudio(folder, camera, [photos[0], black], room_map_file)
     kinds = [("paper", "default", 0), ("paper", "default", 1), ("paper", "published", 0), ("paper", "published", 1)]
     kinds += [("chen", "default", 0), ("sweep-rotation", "default", 0), ("sweep-translation", "default", 0)]
     runs = []
@@ -132,7 +132,7 @@ def test_command_writes_the_report_and_goes_on_from_it(tmp_path, room, room_came
     folder = tmp_path / "<b>&amp; room"
     folder.mkdir()
     camera = room_camera.scaled(320, 240)
-    write_nerfstudio(folder, camera, simulate_queries(room, camera, count=1, seed=5), room_map_file)
+    write_nerfstudio(folder, camera, simulate_photos(room, camera, count=1, seed=5), room_map_file)
     report = tmp_path / "report"
     arguments = [str(folder), "--matcher", "sift", "--sigma", "0.2", "--report", str(report)]
     assert main(arguments) == 0

@@ -102,10 +102,10 @@ def turned(pose: np.ndarray, degrees: float) -> np.ndarray:
     return pose @ make_pose(so3_exp(np.radians([0.0, degrees, 0.0])), np.zeros(3))
 
 
-def test_views_that_share_something_with_the_photo_come_first(renderer, room_camera, room_queries) -> None:
-    truth = room_queries[0].T_map_camera
+def test_views_that_share_something_with_the_photo_come_first(renderer, room_camera, room_photos) -> None:
+    truth = room_photos[0].T_map_camera
     poses = [turned(truth, 180), turned(truth, 20), turned(truth, 5)]
-    views = seen(renderer, room_camera, room_queries[0].image, poses)
+    views = seen(renderer, room_camera, room_photos[0].image, poses)
     np.testing.assert_array_equal(views[-1].pose, poses[0])
     assert views[0].inliers >= views[1].inliers > views[2].inliers
     followed = promising(views)
@@ -115,30 +115,30 @@ def test_views_that_share_something_with_the_photo_come_first(renderer, room_cam
         assert translation_error(view.solution.T_map_camera, truth) < 0.1
 
 
-def test_views_that_share_nothing_are_not_followed(renderer, room_camera, room_queries) -> None:
-    truth = room_queries[0].T_map_camera
-    assert promising(seen(renderer, room_camera, room_queries[0].image, [turned(truth, 180)])) == []
-    assert promising(seen(renderer, room_camera, room_queries[0].image, [])) == []
+def test_views_that_share_nothing_are_not_followed(renderer, room_camera, room_photos) -> None:
+    truth = room_photos[0].T_map_camera
+    assert promising(seen(renderer, room_camera, room_photos[0].image, [turned(truth, 180)])) == []
+    assert promising(seen(renderer, room_camera, room_photos[0].image, [])) == []
 
 
-def test_finds_a_camera_that_was_turned_away(renderer, room_camera, room_queries) -> None:
+def test_finds_a_camera_that_was_turned_away(renderer, room_camera, room_photos) -> None:
     """The prior looks at another wall. The prior's covariance says how far to look."""
-    query = room_queries[1]
-    prior = turned(query.T_map_camera, 100)
+    photo = room_photos[1]
+    prior = turned(photo.T_map_camera, 100)
     covariance = np.diag([0.01] * 3 + [1.0] * 3)
     matcher = create_matcher("sift")
     without = Localizer(renderer, matcher, LocalizerOptions(max_views=0))
-    assert without.localize(query.image, room_camera, prior).status is not Status.LOCALIZED
-    estimate = Localizer(renderer, matcher).localize(query.image, room_camera, prior, covariance)
+    assert without.localize(photo.image, room_camera, prior).status is not Status.LOCALIZED
+    estimate = Localizer(renderer, matcher).localize(photo.image, room_camera, prior, covariance)
     assert estimate.localized, estimate.reason
     assert 0 < estimate.views <= 32
-    assert rotation_error_deg(estimate.T_map_camera, query.T_map_camera) < 1.0
-    assert translation_error(estimate.T_map_camera, query.T_map_camera) < 0.02
+    assert rotation_error_deg(estimate.T_map_camera, photo.T_map_camera) < 1.0
+    assert translation_error(estimate.T_map_camera, photo.T_map_camera) < 0.02
 
 
-def test_easy_queries_search_nothing(renderer, room_camera, room_queries) -> None:
-    query = room_queries[0]
-    estimate = Localizer(renderer, create_matcher("sift")).localize(query.image, room_camera, query.T_map_camera_prior)
+def test_easy_photos_search_nothing(renderer, room_camera, room_photos) -> None:
+    photo = room_photos[0]
+    estimate = Localizer(renderer, create_matcher("sift")).localize(photo.image, room_camera, photo.T_map_camera_prior)
     assert estimate.localized
     assert estimate.views == 0
 
@@ -153,7 +153,7 @@ def test_the_search_ends_with_a_reason(renderer, room_camera) -> None:
 
 
 @pytest.mark.parametrize("covariance", [np.eye(3), np.full((6, 6), np.nan)])
-def test_refuses_a_covariance_that_is_none(renderer, room_camera, room_queries, covariance) -> None:
+def test_refuses_a_covariance_that_is_none(renderer, room_camera, room_photos, covariance) -> None:
     localizer = Localizer(renderer, create_matcher("sift"))
     with pytest.raises(ValueError, match="covariance"):
-        localizer.localize(room_queries[0].image, room_camera, np.eye(4), covariance)
+        localizer.localize(room_photos[0].image, room_camera, np.eye(4), covariance)

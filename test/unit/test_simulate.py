@@ -13,7 +13,7 @@ from rosbags.typesys import Stores, get_typestore
 from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.geometry import make_pose, matrix_from_quaternion, rotation_error_deg, translation_error
 from gsfeatloc_ros.render import create_renderer
-from gsfeatloc_ros.simulate import Room, simulate_queries, write_bag
+from gsfeatloc_ros.simulate import Room, simulate_photos, write_bag
 from gsfeatloc_ros.simulate.photos import CLEARANCE, PRIOR_ROTATION_DEG, PRIOR_TRANSLATION, Walk, look
 from gsfeatloc_ros.simulate.room import pixel_rays
 from gsfeatloc_ros.simulate.room_camera import RoomCamera
@@ -142,27 +142,27 @@ def test_walk_keeps_clear_of_everything(room, seed, time):
     assert pose[2, 1] < -0.8
 
 
-def test_no_queries(room, room_camera):
-    assert simulate_queries(room, room_camera, count=0) == []
+def test_no_photos(room, room_camera):
+    assert simulate_photos(room, room_camera, count=0) == []
 
 
-def test_queries_have_rough_priors_in_free_space(room, room_camera, room_queries):
-    stamps = [query.stamp for query in room_queries]
+def test_photos_have_priors_in_free_space(room, room_camera, room_photos):
+    stamps = [photo.stamp for photo in room_photos]
     assert stamps == sorted(set(stamps))
-    for query in room_queries:
-        assert query.image.shape == (room_camera.height, room_camera.width, 3)
-        assert query.image.dtype == np.uint8
-        degrees = rotation_error_deg(query.T_map_camera, query.T_map_camera_prior)
+    for photo in room_photos:
+        assert photo.image.shape == (room_camera.height, room_camera.width, 3)
+        assert photo.image.dtype == np.uint8
+        degrees = rotation_error_deg(photo.T_map_camera, photo.T_map_camera_prior)
         assert PRIOR_ROTATION_DEG[0] <= degrees <= PRIOR_ROTATION_DEG[1]
-        metres = translation_error(query.T_map_camera, query.T_map_camera_prior)
+        metres = translation_error(photo.T_map_camera, photo.T_map_camera_prior)
         assert PRIOR_TRANSLATION[0] <= metres <= PRIOR_TRANSLATION[1]
-        assert room.is_free(query.T_map_camera_prior[None, :3, 3], CLEARANCE)[0]
+        assert room.is_free(photo.T_map_camera_prior[None, :3, 3], CLEARANCE)[0]
 
 
-def test_queries_of_a_seed_are_the_same(room, room_camera, room_queries):
-    (again,) = simulate_queries(room, room_camera, count=1, seed=0)
-    np.testing.assert_array_equal(again.image, room_queries[0].image)
-    np.testing.assert_array_equal(again.T_map_camera_prior, room_queries[0].T_map_camera_prior)
+def test_photos_of_a_seed_are_the_same(room, room_camera, room_photos):
+    (again,) = simulate_photos(room, room_camera, count=1, seed=0)
+    np.testing.assert_array_equal(again.image, room_photos[0].image)
+    np.testing.assert_array_equal(again.T_map_camera_prior, room_photos[0].T_map_camera_prior)
 
 
 @pytest.fixture(scope="module")
@@ -179,8 +179,8 @@ def take_photo(photographer, pose_at, seed: int = 0) -> np.ndarray:
     return photographer.photo(pose_at, 0.0, np.random.default_rng(seed)).astype(np.float32) / 255
 
 
-def test_still_photo_is_what_the_tracer_sees_but_for_light_and_noise(room, small_camera, photographer, room_queries):
-    pose = room_queries[0].T_map_camera
+def test_still_photo_is_what_the_tracer_sees_but_for_light_and_noise(room, small_camera, photographer, room_photos):
+    pose = room_photos[0].T_map_camera
     middle = np.s_[70:170, 110:210]  # the corners are darker
     photo = take_photo(photographer, lambda time: pose)[middle]
     seen = room.trace(small_camera, pose, samples=3).rgb[middle]
@@ -188,8 +188,8 @@ def test_still_photo_is_what_the_tracer_sees_but_for_light_and_noise(room, small
     assert psnr(photo, gains * seen) > 28
 
 
-def test_photos_differ_in_exposure_and_noise(photographer, room_queries):
-    pose = room_queries[0].T_map_camera
+def test_photos_differ_in_exposure_and_noise(photographer, room_photos):
+    pose = room_photos[0].T_map_camera
     photos = [take_photo(photographer, lambda time: pose, seed) for seed in range(4)]
     means = [photo.mean() for photo in photos]
     assert max(means) / min(means) > 1.03
@@ -197,14 +197,14 @@ def test_photos_differ_in_exposure_and_noise(photographer, room_queries):
     assert 1 / 255 < noise < 10 / 255
 
 
-def test_corners_of_photos_are_darker(room, small_camera, photographer, room_queries):
-    pose = room_queries[0].T_map_camera
+def test_corners_of_photos_are_darker(room, small_camera, photographer, room_photos):
+    pose = room_photos[0].T_map_camera
     ratio = take_photo(photographer, lambda time: pose) / np.maximum(room.trace(small_camera, pose, samples=1).rgb, 0.1)
     assert np.median(ratio[:40, :40]) < 0.9 * np.median(ratio[100:140, 140:180])
 
 
-def test_motion_blurs(photographer, room_queries):
-    place = room_queries[0].T_map_camera[:3, 3]
+def test_motion_blurs(photographer, room_photos):
+    place = room_photos[0].T_map_camera[:3, 3]
     sharp = take_photo(photographer, lambda time: make_pose(look(0.0, -0.2), place))
     blurred = take_photo(photographer, lambda time: make_pose(look(3.0 * time, -0.2), place))
     # The camera turns about the vertical: what changes from left to right is lost.
@@ -215,11 +215,11 @@ def test_motion_blurs(photographer, room_queries):
 # The map
 
 
-def test_map_looks_like_the_room(room, room_map, room_camera, room_queries):
+def test_map_looks_like_the_room(room, room_map, room_camera, room_photos):
     pinhole = Camera(room_camera.width, room_camera.height, room_camera.K)
     renderer = create_renderer(room_map)
-    for query in room_queries[::4]:
-        trace, render = room.trace(pinhole, query.T_map_camera), renderer.render(pinhole, query.T_map_camera)
+    for photo in room_photos[::4]:
+        trace, render = room.trace(pinhole, photo.T_map_camera), renderer.render(pinhole, photo.T_map_camera)
         assert psnr(render.rgb, trace.rgb) > 21
         assert render.alpha.mean() > 0.99
         assert np.nanmedian(np.abs(render.depth - trace.depth)) < 0.006
@@ -239,26 +239,26 @@ def test_map_has_a_fit_number_of_gaussians_and_none_under_the_furniture(room, ro
 # The bag
 
 
-def test_bag_holds_the_queries(tmp_path, room_camera, room_queries):
-    write_bag(tmp_path / "bag", room_camera, room_queries)
+def test_bag_holds_the_photos(tmp_path, room_camera, room_photos):
+    write_bag(tmp_path / "bag", room_camera, room_photos)
     types = get_typestore(Stores.ROS2_JAZZY)
     with Reader(tmp_path / "bag") as bag:
         messages = [
             (connection.topic, types.deserialize_cdr(cdr, connection.msgtype)) for connection, _, cdr in bag.messages()
         ]
     order = ["/prior", "/camera/camera_info", "/camera/image_raw", "/ground_truth"]
-    assert [topic for topic, _ in messages] == order * len(room_queries)
-    for index, query in enumerate(room_queries):
+    assert [topic for topic, _ in messages] == order * len(room_photos)
+    for index, photo in enumerate(room_photos):
         prior, info, image, truth = (message for _, message in messages[4 * index : 4 * index + 4])
         for message in (prior, info, image, truth):
             stamp = message.header.stamp
-            assert stamp.sec + 1e-9 * stamp.nanosec == pytest.approx(query.stamp, abs=1e-6)
+            assert stamp.sec + 1e-9 * stamp.nanosec == pytest.approx(photo.stamp, abs=1e-6)
         assert image.encoding == "rgb8"
-        np.testing.assert_array_equal(image.data.reshape(image.height, image.width, 3), query.image)
+        np.testing.assert_array_equal(image.data.reshape(image.height, image.width, 3), photo.image)
         np.testing.assert_array_equal(info.k.reshape(3, 3), room_camera.K)
         np.testing.assert_array_equal(info.d, room_camera.distortion)
         assert (info.width, info.height, info.distortion_model) == (640, 480, "plumb_bob")
-        for message, pose in ((prior, query.T_map_camera_prior), (truth, query.T_map_camera)):
+        for message, pose in ((prior, photo.T_map_camera_prior), (truth, photo.T_map_camera)):
             p, q = message.pose.position, message.pose.orientation
             assert message.header.frame_id == "map"
             written = make_pose(matrix_from_quaternion(np.array([q.x, q.y, q.z, q.w])), np.array([p.x, p.y, p.z]))

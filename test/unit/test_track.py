@@ -52,17 +52,17 @@ def test_corners_of_a_moved_picture_are_found_to_a_tenth_of_a_pixel(
 
 
 @both_trackers
-def test_corners_are_found_in_renders_near_the_photo(tracker_of, room_map, room_camera, room_queries) -> None:
+def test_corners_are_found_in_renders_near_the_photo(tracker_of, room_map, room_camera, room_photos) -> None:
     """The truth is the geometry: the corner's point of the room, seen from the other pose."""
-    query = room_queries[0]
-    photo = Photo.undistorted(query.image, room_camera, 640)
-    near = query.T_map_camera @ make_pose(so3_exp(np.radians([0.4, -0.5, 0.3])), np.array([0.02, 0.01, -0.01]))
+    simulated = room_photos[0]
+    photo = Photo.undistorted(simulated.image, room_camera, 640)
+    near = simulated.T_map_camera @ make_pose(so3_exp(np.radians([0.4, -0.5, 0.3])), np.array([0.02, 0.01, -0.01]))
     renderer = create_renderer(room_map, "cpu")
     matches = tracker_of(photo).track(renderer.render(photo.camera, near).image())
     assert len(matches) > 100
     columns, rows = np.rint(matches.a).astype(int).T
-    depth = renderer.render(photo.camera, query.T_map_camera).median_depth[rows, columns].astype(np.float64)
-    points = transform(invert(near) @ query.T_map_camera, photo.camera.rays(matches.a) * depth[:, None])
+    depth = renderer.render(photo.camera, simulated.T_map_camera).median_depth[rows, columns].astype(np.float64)
+    points = transform(invert(near) @ simulated.T_map_camera, photo.camera.rays(matches.a) * depth[:, None])
     errors = np.linalg.norm(photo.camera.project(points) - matches.b, axis=1)
     assert np.nanmedian(errors) < 1.0  # the map's discs are not quite where the texture is
     assert np.nanmean(errors < 3) > 0.85

@@ -33,10 +33,10 @@ def correlation(image: np.ndarray, camera: Camera, render: Render) -> float:
 
 
 @pytest.fixture(scope="module")
-def seen(room_map, room_camera, room_queries):
+def seen(room_map, room_camera, room_photos):
     """A photo and the render at its true pose."""
-    query = room_queries[0]
-    return query.image, create_renderer(room_map).render(room_camera, query.T_map_camera)
+    photo = room_photos[0]
+    return photo.image, create_renderer(room_map).render(room_camera, photo.T_map_camera)
 
 
 def test_photo_agrees_with_the_render_at_the_truth(seen, room_camera) -> None:
@@ -52,9 +52,9 @@ def test_exposure_does_not_count(seen, room_camera, gain: float, gamma: float) -
     assert correlation(exposed, room_camera, render) > correlation(image, room_camera, render) - 0.1
 
 
-def test_the_render_at_another_place_does_not_agree(seen, room_map, room_camera, room_queries) -> None:
+def test_the_render_at_another_place_does_not_agree(seen, room_map, room_camera, room_photos) -> None:
     image, _ = seen
-    elsewhere = create_renderer(room_map).render(room_camera, room_queries[4].T_map_camera)
+    elsewhere = create_renderer(room_map).render(room_camera, room_photos[4].T_map_camera)
     assert abs(correlation(image, room_camera, elsewhere)) < 0.3
 
 
