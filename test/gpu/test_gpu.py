@@ -26,8 +26,8 @@ import torch
 from cuda_on_cpu.gsplat_on_cpu import import_on_cpu
 from hypothesis import given
 from hypothesis import strategies as st
+from small_maps import assert_same, concatenated, one_gaussian, psnr, random_map, small_camera
 from stand_in.gpu import SimulatedGpu, as_kernel, simulated_gpu
-from test_render import assert_same, concatenated, one_gaussian, psnr, random_map, small_camera
 
 from gsfeatloc_ros.benchmark.frames import measure_frames
 from gsfeatloc_ros.common.device import explain_fallback, gpu_problem

@@ -8,8 +8,8 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pictures import rectangles, shifted
 from stand_in.gpu import simulated_gpu
-from test_match import shifted, texture
 
 from gsfeatloc_ros.common.arrays import to_host
 from gsfeatloc_ros.match.base import Features
@@ -47,7 +47,7 @@ def test_pictures_of_one_colour_have_no_features(size: tuple[int, int], value: i
     assert features.keypoints.shape == (0, 2)
     assert features.descriptors.shape == (0, 128)
     assert features.scores.shape == (0,)
-    something = sift.features(texture(64, 64))
+    something = sift.features(rectangles(64, 64))
     for a, b in ((features, features), (features, something), (something, features)):
         assert len(sift.match(a, b)) == 0
 
@@ -64,7 +64,7 @@ def test_noise_of_any_size_does_no_harm(height: int, width: int, seed: int) -> N
 
 
 def test_the_strongest_are_kept_and_come_first() -> None:
-    image = texture(HEIGHT, WIDTH)
+    image = rectangles(HEIGHT, WIDTH)
     everything, few = on_cpu().features(image), on_cpu(50).features(image)
     assert len(everything) > 300
     assert len(few) == 50
@@ -77,7 +77,7 @@ def test_the_strongest_are_kept_and_come_first() -> None:
 
 @pytest.mark.parametrize("size", [(HEIGHT, WIDTH), (96, 128), (60, 400)])
 def test_features_are_opencvs(size: tuple[int, int]) -> None:
-    image = texture(*size)
+    image = rectangles(*size)
     ours, theirs = on_host(on_cpu().features(image)), Sift(2048).features(image)
     for a, b in ((ours, theirs), (theirs, ours)):
         distance, cosine = together(a, b)
@@ -88,7 +88,7 @@ def test_features_are_opencvs(size: tuple[int, int]) -> None:
 
 def test_features_at_the_border_are_opencvs() -> None:
     """Beyond it in memory are other octaves, of which nothing may be seen."""
-    image = texture(HEIGHT, WIDTH)
+    image = rectangles(HEIGHT, WIDTH)
     ours, theirs = on_host(on_cpu().features(image)), Sift(2048).features(image)
     at_border = np.minimum(ours.keypoints, [WIDTH - 1, HEIGHT - 1] - ours.keypoints).min(axis=1) < 8
     assert at_border.sum() > 20
@@ -103,7 +103,7 @@ def test_features_at_the_border_are_opencvs() -> None:
 @settings(deadline=None, max_examples=5)
 @given(st.floats(-180, 180), st.floats(0.7, 1.4), st.floats(-5, 5), st.floats(-5, 5))
 def test_matches_of_a_turned_scaled_and_moved_picture_are_where_they_belong(angle, scale, dx, dy) -> None:
-    image = texture(HEIGHT, WIDTH)
+    image = rectangles(HEIGHT, WIDTH)
     move = cv2.getRotationMatrix2D(((WIDTH - 1) / 2, (HEIGHT - 1) / 2), angle, scale)
     move[:, 2] += dx, dy
     moved = cv2.warpAffine(
@@ -126,7 +126,7 @@ def test_matches_of_a_turned_scaled_and_moved_picture_are_where_they_belong(angl
 
 @pytest.mark.parametrize("move", [(0.5, 0.0), (0.25, -0.75), (3.4, -2.3)])
 def test_keypoints_move_by_fractions_of_a_pixel(move: tuple[float, float]) -> None:
-    image = texture(HEIGHT, WIDTH)
+    image = rectangles(HEIGHT, WIDTH)
     sift = on_cpu()
     matches = sift.match(sift.features(image), sift.features(shifted(image, *move)))
     error = matches.b - matches.a - move
@@ -140,7 +140,7 @@ def test_keypoints_move_by_fractions_of_a_pixel(move: tuple[float, float]) -> No
 
 
 def test_pictures_on_the_device_stay_there_until_the_matches() -> None:
-    image = texture(HEIGHT, WIDTH)
+    image = rectangles(HEIGHT, WIDTH)
     moved = shifted(image, 3.4, -2.3)
     reference = on_cpu()
     wanted = reference.match(reference.features(image), reference.features(moved))

@@ -12,8 +12,8 @@ import torch
 import torch.nn.functional as F
 from kornia.feature import LightGlue
 from kornia.geometry.subpix import nms2d
+from pictures import rectangles, shifted
 from stand_in.gpu import SimulatedGpu, as_kernel, simulated_gpu
-from test_match import shifted, texture
 from torch.nn.attention import SDPBackend, sdpa_kernel
 
 from gsfeatloc_ros.match.aliked import AlikedExtractor
@@ -271,7 +271,7 @@ def test_counts_start_anew(gpu, x) -> None:
 # The CPU has a kernel of its own for attention, which is taken apart for the device.
 STEPS = SDPBackend.MATH
 
-IMAGE = torch.from_numpy(texture(48, 64)).permute(2, 0, 1)[None].float() / 255
+IMAGE = torch.from_numpy(rectangles(48, 64)).permute(2, 0, 1)[None].float() / 255
 SQUARE = IMAGE[0, 0, :8, :8] + 4 * torch.eye(8)
 
 
@@ -346,7 +346,7 @@ def disk_lightglue(device: str) -> Matcher:
 def test_learned_matchers(monkeypatch, create) -> None:
     # Of the devices that kornia knows LightGlue drops features on all alike but CUDA.
     monkeypatch.setitem(LightGlue.pruning_keypoint_thresholds, SimulatedGpu.device, -1)
-    images = [texture(96, 128), shifted(texture(96, 128), 3.4, -2.3)]
+    images = [rectangles(96, 128), shifted(rectangles(96, 128), 3.4, -2.3)]
     on_cpu = create("cpu")
     with sdpa_kernel(STEPS):
         wanted = on_cpu.match(*(on_cpu.features(image) for image in images))

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from pictures import photo_of, smooth_noise
 from stand_in.gpu import simulated_gpu
-from test_track import photo_of, textured
 
 from gsfeatloc_ros.common.local_structure import local_structure
 from gsfeatloc_ros.match.track import DISTANCE, GAIN, MAX_CORNERS, MIN_CONTRAST, NEIGHBOURHOOD, CornerTracker
@@ -43,20 +43,20 @@ def test_blank_pictures_have_no_corners_and_no_matches(value: int) -> None:
         warnings.simplefilter("error")
         tracker = on_cpu(blank)
         assert tracker.corners.shape == (0, 2)
-        assert len(tracker.track(textured(0))) == 0
-        assert len(on_cpu(textured(0)).track(blank)) == 0
+        assert len(tracker.track(smooth_noise(0))) == 0
+        assert len(on_cpu(smooth_noise(0)).track(blank)) == 0
 
 
 @pytest.mark.parametrize("size", [(1, 1), (2, 9), (9, 12), (16, 40), (31, 33)])
 def test_small_pictures_do_no_harm(size: tuple[int, int]) -> None:
-    image = textured(0)[: size[0], : size[1]]
+    image = smooth_noise(0)[: size[0], : size[1]]
     matches = on_cpu(image).track(image)
     np.testing.assert_allclose(matches.b, matches.a, atol=1e-3)
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_corners_are_opencvs(seed: int) -> None:
-    photo = photo_of(textured(seed, 300, 400))
+    photo = photo_of(smooth_noise(seed, 300, 400))
     ours, theirs = GpuCornerTracker(photo, "cpu").corners, CornerTracker(photo).corners
     a, b = (set(map(tuple, corners)) for corners in (ours, theirs))
     assert len(theirs) > 300
@@ -84,7 +84,7 @@ def test_corners_of_a_chessboard_which_are_all_equal_are_found_once() -> None:
 
 
 def test_the_border_of_what_the_lens_saw_is_no_corner() -> None:
-    photo = photo_of(textured(0))
+    photo = photo_of(smooth_noise(0))
     seen = np.zeros((HEIGHT, WIDTH), bool)
     seen[20:100, 30:130] = True
     photo = replace(photo, seen=seen, image=photo.image * seen[..., None].astype(np.uint8))
@@ -95,7 +95,7 @@ def test_the_border_of_what_the_lens_saw_is_no_corner() -> None:
 
 
 def test_the_pyramid_is_of_local_structure_and_opencvs_halvings() -> None:
-    photo = photo_of(textured(2, 151, 233))
+    photo = photo_of(smooth_noise(2, 151, 233))
     structure = GAIN * local_structure(photo.gray(), NEIGHBOURHOOD, MIN_CONTRAST)[0]
     expected = np.clip(structure, -128, 128)
     for level in GpuCornerTracker(photo, "cpu")._pyramid:
@@ -110,7 +110,7 @@ def test_the_pyramid_is_of_local_structure_and_opencvs_halvings() -> None:
 def test_flow_is_opencvs(seed: int, size: float) -> None:
     """A picture seen through a homography that moves its corners by `size` times some pixels."""
     rng = np.random.default_rng(seed)
-    image = textured(seed)
+    image = smooth_noise(seed)
     frame = np.array([[0, 0], [WIDTH, 0], [WIDTH, HEIGHT], [0, HEIGHT]], np.float32)
     homography = cv2.getPerspectiveTransform(frame, frame + size * rng.normal(size=(4, 2)).astype(np.float32))
     other = seen_through(image, homography)
@@ -127,7 +127,7 @@ def test_flow_is_opencvs(seed: int, size: float) -> None:
 
 
 def test_corners_that_leave_the_picture_are_not_found() -> None:
-    image = textured(4)
+    image = smooth_noise(4)
     matches = on_cpu(image).track(seen_through(image, shift(-12.3, 0)))
     assert len(matches) > 50
     assert (matches.b >= 0).all()
@@ -137,7 +137,7 @@ def test_corners_that_leave_the_picture_are_not_found() -> None:
 
 
 def test_on_a_gpu_all_stays_there_but_what_is_found() -> None:
-    image, other = textured(0), seen_through(textured(0), shift(2.5, -1.5))
+    image, other = smooth_noise(0), seen_through(smooth_noise(0), shift(2.5, -1.5))
     expected = on_cpu(image).track(other)
     with simulated_gpu() as gpu:
         render = torch.from_numpy(other).to(gpu.device)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 import pytest
 import torch
 from kornia.color import rgb_to_grayscale
+from pictures import rectangles, shifted
 from random_weights import WRITERS
 
 from gsfeatloc_ros.common.arrays import to_host
@@ -44,23 +44,6 @@ def trained(request):
     return request.param, create_matcher(request.param)
 
 
-def texture(height: int, width: int) -> np.ndarray:
-    """Overlapping bright and dark rectangles, turned at random, as smooth as a photo."""
-    rng = np.random.default_rng(3)
-    image = np.full((height, width, 3), 128, np.uint8)
-    for _ in range(height * width // 150):
-        center, size = rng.uniform([0, 0], [width, height]), rng.uniform(6, 40, 2)
-        corners = cv2.boxPoints((center.tolist(), size.tolist(), rng.uniform(0, 90)))
-        cv2.fillConvexPoly(image, corners.astype(np.int32), rng.integers(0, 256, 3).tolist(), cv2.LINE_AA)
-    return cv2.GaussianBlur(image, (0, 0), 0.8)
-
-
-def shifted(image: np.ndarray, dx: float, dy: float) -> np.ndarray:
-    """The image moved right and down by a fraction of a pixel."""
-    move = np.float64([[1, 0, dx], [0, 1, dy]])
-    return cv2.warpAffine(image, move, image.shape[1::-1], flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
-
-
 def test_every_matcher_is_tested() -> None:
     assert {*TOLERANCES, *WRITERS} == set(MATCHERS)
 
@@ -71,7 +54,7 @@ def test_every_matcher_is_tested() -> None:
 @pytest.mark.parametrize("size", [(240, 320), (213, 317)], ids=["multiple of 16", "odd"])
 def test_finds_a_subpixel_shift(trained, size) -> None:
     name, matcher = trained
-    image = texture(*size)
+    image = rectangles(*size)
     a, b = matcher.features(image), matcher.features(shifted(image, 3.4, -2.3))
     matches = matcher.match(a, b)
     assert len(matches) > 50
@@ -80,7 +63,7 @@ def test_finds_a_subpixel_shift(trained, size) -> None:
 
 
 def test_keypoints_are_inside_the_image_with_unit_descriptors(trained) -> None:
-    features = trained[1].features(texture(101, 203))
+    features = trained[1].features(rectangles(101, 203))
     assert len(features) > 0
     assert features.keypoints.shape == (len(features), 2)
     keypoints = to_host(features.keypoints)
@@ -98,7 +81,7 @@ def test_an_image_of_nothing_has_no_features(trained, value: int) -> None:
 
 
 def test_matches_are_pixels_of_the_two_images_with_a_score(matcher) -> None:
-    a, b = (matcher.features(texture(*size)) for size in [(101, 203), (64, 96)])
+    a, b = (matcher.features(rectangles(*size)) for size in [(101, 203), (64, 96)])
     for matches in (matcher.match(a, b), matcher.match(a, a)):
         assert matches.a.shape == matches.b.shape == (len(matches), 2)
         assert matches.a.dtype == matches.b.dtype == matches.scores.dtype == np.float64
@@ -108,7 +91,7 @@ def test_matches_are_pixels_of_the_two_images_with_a_score(matcher) -> None:
 
 def test_no_features_have_no_matches(matcher) -> None:
     # Of one pixel no network makes anything.
-    nothing, something = matcher.features(np.zeros((1, 1, 3), np.uint8)), matcher.features(texture(120, 160))
+    nothing, something = matcher.features(np.zeros((1, 1, 3), np.uint8)), matcher.features(rectangles(120, 160))
     assert len(nothing) == 0
     assert len(something) > 0
     for a, b in ((nothing, something), (something, nothing), (nothing, nothing)):
@@ -119,14 +102,14 @@ def test_no_features_have_no_matches(matcher) -> None:
 
 @pytest.mark.parametrize("size", [(5, 7), (31, 33)])
 def test_tiny_images_do_no_harm(matcher, size) -> None:
-    features = matcher.features(texture(64, 64)[: size[0], : size[1]].copy())
+    features = matcher.features(rectangles(64, 64)[: size[0], : size[1]].copy())
     assert len(matcher.match(features, features)) <= len(features)
 
 
 @pytest.mark.parametrize("name", MATCHERS)
 def test_max_features_is_kept(create, name) -> None:
     matcher = create(name, max_features=50)
-    features = matcher.features(texture(240, 320))
+    features = matcher.features(rectangles(240, 320))
     assert len(matcher.match(features, features)) <= 51
     if name != "loftr":  # which has no keypoints
         assert 0 < len(features) <= 51
@@ -137,7 +120,7 @@ def test_superpoint_matches_are_those_of_the_whole_model(create, monkeypatch, na
     """The model's own forward(), which takes both images at once and leaves keypoints on whole pixels, is the judge."""
     monkeypatch.setattr("gsfeatloc_ros.match.superpoint.centroid", lambda peaks, heatmap: peaks.float())
     matcher = create(name, max_features=100)
-    image = texture(96, 128)
+    image = rectangles(96, 128)
     for images, least in (([image, image], 5), ([image, shifted(image, 5, 8)], 1)):
         matches = matcher.match(*map(matcher.features, images))
         with torch.inference_mode():
@@ -154,7 +137,7 @@ def test_loftr_matches_cells_of_eight_pixels_in_colmap_s_convention(create) -> N
     matcher = create("loftr")
     # Untrained it is confident of nothing.
     matcher._loftr.coarse_matching.thr = 0.0
-    features = matcher.features(texture(96, 128))
+    features = matcher.features(rectangles(96, 128))
     assert len(features) == 12 * 16
     matches = matcher.match(features, features)
     assert len(matches) > 5

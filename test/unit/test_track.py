@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pictures import photo_of, smooth_noise
 
 from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.geometry import invert, make_pose, so3_exp, transform
@@ -26,25 +27,13 @@ both_trackers = pytest.mark.parametrize(
 CAMERA = Camera(160, 120, np.array([[150.0, 0, 79.5], [0, 150.0, 59.5], [0, 0, 1]]))
 
 
-def photo_of(image: np.ndarray) -> Photo:
-    height, width = image.shape[:2]
-    return Photo.undistorted(image, Camera(width, height, CAMERA.K), width)
-
-
-def textured(seed: int, height: int = 120, width: int = 160) -> np.ndarray:
-    """Smooth noise with structure of several sizes."""
-    rng = np.random.default_rng(seed)
-    layers = [cv2.GaussianBlur(rng.normal(size=(height, width, 3)), (0, 0), sigma) * sigma for sigma in (1.5, 4, 9)]
-    return np.clip(128 + 40 * sum(layers), 0, 255).astype(np.uint8)
-
-
 @both_trackers
 @settings(deadline=None, max_examples=20)
 @given(seed=st.integers(0, 1000), dx=st.floats(-6, 6), dy=st.floats(-6, 6))
 def test_corners_of_a_moved_picture_are_found_to_a_tenth_of_a_pixel(
     tracker_of, seed: int, dx: float, dy: float
 ) -> None:
-    image = textured(seed)
+    image = smooth_noise(seed)
     moved = cv2.warpAffine(image, np.array([[1, 0, dx], [0, 1, dy]]), (160, 120), flags=cv2.INTER_CUBIC)
     matches = tracker_of(photo_of(image)).track(moved)
     assert len(matches) > 30
@@ -71,7 +60,7 @@ def test_corners_are_found_in_renders_near_the_photo(tracker_of, room_map, room_
 @both_trackers
 @pytest.mark.parametrize(("gain", "least", "error"), [(0.4, 0.4, 0.5), (0.7, 0.7, 0.2), (1.3, 0.8, 0.2)])
 def test_todays_light_does_not_count(tracker_of, gain: float, least: float, error: float) -> None:
-    image = textured(3)
+    image = smooth_noise(3)
     ramp = np.linspace(0.6, 1.0, 160)[None, :, None]
     lit = np.clip(gain * ramp * image, 0, 255).astype(np.uint8)
     matches = tracker_of(photo_of(image)).track(lit)
@@ -81,8 +70,8 @@ def test_todays_light_does_not_count(tracker_of, gain: float, least: float, erro
 
 @both_trackers
 def test_what_is_not_there_is_not_found(tracker_of) -> None:
-    tracker = tracker_of(photo_of(textured(1)))
-    assert len(tracker.track(textured(2))) < 0.2 * len(tracker.corners)
+    tracker = tracker_of(photo_of(smooth_noise(1)))
+    assert len(tracker.track(smooth_noise(2))) < 0.2 * len(tracker.corners)
 
 
 @both_trackers
@@ -91,8 +80,8 @@ def test_blank_pictures_have_no_corners(tracker_of, value: int) -> None:
     blank = np.full((120, 160, 3), value, np.uint8)
     tracker = tracker_of(photo_of(blank))
     assert len(tracker.corners) == 0
-    assert len(tracker.track(textured(0))) == 0
-    found = tracker_of(photo_of(textured(0))).track(blank)
+    assert len(tracker.track(smooth_noise(0))) == 0
+    found = tracker_of(photo_of(smooth_noise(0))).track(blank)
     assert np.isfinite(found.b).all()
 
 
@@ -108,7 +97,7 @@ def test_the_border_of_what_the_lens_saw_is_no_corner(tracker_of) -> None:
 @pytest.mark.parametrize("model", ["plumb_bob", "equidistant"])
 def test_a_photo_loses_its_distortion_and_its_size_once(model: str) -> None:
     camera = Camera(160, 120, CAMERA.K, np.array([-0.2, 0.05, 0.0, 0.0]), model)
-    photo = Photo.undistorted(textured(0), camera, 80)
+    photo = Photo.undistorted(smooth_noise(0), camera, 80)
     assert photo.image.shape == (60, 80, 3)
     assert photo.seen.shape == photo.gray().shape == (60, 80)
     assert not photo.camera.distorted
@@ -121,7 +110,7 @@ def test_a_photo_loses_its_distortion_and_its_size_once(model: str) -> None:
 
 @given(gain=st.floats(0.5, 1.0), offset=st.floats(0, 50))
 def test_structure_does_not_know_brightness_and_contrast(gain: float, offset: float) -> None:
-    gray = np.clip(textured(5)[..., 0] * 0.7 + 20, 0, 255).astype(np.uint8)
+    gray = np.clip(smooth_noise(5)[..., 0] * 0.7 + 20, 0, 255).astype(np.uint8)
     changed = np.rint(gain * gray + offset).astype(np.uint8)
     a, b = (local_structure(image, 6.0, 2.0)[0] for image in (gray, changed))
     assert np.corrcoef(a.ravel(), b.ravel())[0, 1] > 0.99
