@@ -1,0 +1,1 @@
+"""What all rooms share: geometry, cameras, photos, and where arrays lie."""

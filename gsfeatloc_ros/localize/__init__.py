@@ -1,0 +1,1 @@
+"""The pipeline: photo and prior in, pose out. Read localizer.py first."""

@@ -1,14 +1,16 @@
-"""What localizes, made from the node's parameters: a map, a renderer, a matcher."""
+"""A localizer made from settings: the same builders serve the node, replay, the evaluation and the benchmark."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 from gsfeatloc_ros.localize.first_run import warm_up
-from gsfeatloc_ros.localize.localizer import Localizer, LocalizerOptions
+from gsfeatloc_ros.localize.localizer import Localizer
+from gsfeatloc_ros.localize.options import LocalizerOptions
+from gsfeatloc_ros.localize.settings import MapSettings, MatcherSettings, RendererSettings
 from gsfeatloc_ros.maps import load_map
 from gsfeatloc_ros.match import Matcher, create_matcher
-from gsfeatloc_ros.node.parameters import Value, localizer_options, map_alignment
 from gsfeatloc_ros.render import Renderer, create_renderer
 from gsfeatloc_ros.render.cache import load_prepared
 
@@ -22,58 +24,69 @@ class Engine:
         renderer: of the map.
         matcher: of features.
         options: of the localizer.
-        localizer: of the three.
     """
 
     map_path: str
     renderer: Renderer
     matcher: Matcher
     options: LocalizerOptions
-    localizer: Localizer
+
+    @cached_property
+    def localizer(self) -> Localizer:
+        """The localizer."""
+        return Localizer(self.renderer, self.matcher, self.options)
 
     def with_options(self, options: LocalizerOptions) -> Engine:
-        """The same with other options."""
-        return replace(self, options=options, localizer=Localizer(self.renderer, self.matcher, options))
+        """Return the same with other options."""
+        return replace(self, options=options)
 
-    def with_map(self, values: dict[str, Value]) -> Engine:
-        """The same with the map of `values`; raises as load_engine does."""
-        renderer = _load_renderer(values)
-        return replace(
-            self,
-            map_path=values["map.path"],
-            renderer=renderer,
-            localizer=Localizer(renderer, self.matcher, self.options),
-        )
+    def with_map(self, map_path: str, renderer: Renderer) -> Engine:
+        """Return the same with another map."""
+        return replace(self, map_path=map_path, renderer=renderer)
 
 
-def load_engine(values: dict[str, Value]) -> Engine:
-    """Load the map and the matcher, and compile and run all code once; takes seconds.
+def load_renderer(
+    map_: MapSettings, renderer: RendererSettings, background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+) -> Renderer:
+    """Load a map and make its renderer.
 
     Args:
-        values: of all parameters by name.
+        map_: which map.
+        renderer: how it is drawn.
+        background: RGB in [0, 1] behind the map.
 
     Raises:
-        ValueError, OSError, RuntimeError: the parameters, the map or the matcher's weights cannot be used; the message
+        ValueError, OSError, RuntimeError: the settings or the map cannot be used; the message says why.
+    """
+    if not map_.path:
+        raise ValueError("parameter map.path is empty: set it to a map file (-p map.path:=/path/to/map.ply)")
+    load = load_prepared if map_.cache else load_map
+    return create_renderer(
+        load(map_.path, map_.alignment()),
+        renderer.device,
+        renderer.threads,
+        background=background,
+        sh_degree=renderer.sh_degree,
+        resolution_scale=renderer.resolution_scale,
+    )
+
+
+def load_matcher(matcher: MatcherSettings, device: str) -> Matcher:
+    """Make a matcher on a device (Renderer.device); raise ValueError or RuntimeError where it cannot be had."""
+    return create_matcher(matcher.name, matcher.weights, matcher.max_features, device)
+
+
+def load_engine(
+    map_: MapSettings, matcher: MatcherSettings, renderer: RendererSettings, options: LocalizerOptions
+) -> Engine:
+    """Load the map and the matcher, and compile and run all code once; takes seconds.
+
+    Raises:
+        ValueError, OSError, RuntimeError: the settings, the map or the matcher's weights cannot be used; the message
             says why.
     """
-    options = localizer_options(values)
-    renderer = _load_renderer(values)
-    matcher = create_matcher(
-        values["matcher.name"], values["matcher.weights"], values["matcher.max_features"], values["renderer.device"]
-    )
+    map_renderer = load_renderer(map_, renderer)
+    loaded = load_matcher(matcher, map_renderer.device)
     # Now, not at the first image: it takes long.
-    warm_up(matcher, values["renderer.device"], values["renderer.threads"])
-    return Engine(values["map.path"], renderer, matcher, options, Localizer(renderer, matcher, options))
-
-
-def _load_renderer(values: dict[str, Value]) -> Renderer:
-    if not values["map.path"]:
-        raise ValueError("parameter map.path is empty: set it to a map file (-p map.path:=/path/to/map.ply)")
-    load = load_prepared if values["map.cache"] else load_map
-    return create_renderer(
-        load(values["map.path"], map_alignment(values)),
-        values["renderer.device"],
-        values["renderer.threads"],
-        sh_degree=values["renderer.sh_degree"],
-        resolution_scale=values["renderer.resolution_scale"],
-    )
+    warm_up(loaded, renderer.device, renderer.threads)
+    return Engine(map_.path, map_renderer, loaded, options)

@@ -7,6 +7,8 @@ from enum import Enum
 
 import numpy as np
 
+from gsfeatloc_ros.common.photo import Photo
+from gsfeatloc_ros.localize.evidence import Evidence
 from gsfeatloc_ros.match.base import Matches
 from gsfeatloc_ros.render.base import Render
 
@@ -30,36 +32,36 @@ class Estimate:
         T_map_camera: (4, 4) float64 pose of the camera (optical axes) in the map frame; None unless LOCALIZED.
         covariance: (6, 6) float64 in ROS order (x y z, rotation about x y z), translation in map units, rotation in
             radians, both about the axes of the map frame at the camera centre; None unless LOCALIZED.
-        matches: number of the photo's corners that were found in the last render; of matches where no pose was found.
-        inliers: number of those that have a depth and agree with the pose.
-        inlier_ratio: share that agrees, with some allowance for blur, of those that have a depth; NaN without pose.
-        coverage: share of the photo's cells, in a grid of 8 x 6, that hold an inlier.
-        agreement: correlation of photo and render at the estimate (pose/acceptance.py); NaN where it cannot be said.
-        reprojection_error: RMS of the inliers' reprojection errors in pixels of the localized image; NaN without pose.
-        passes: number of renders at estimates.
-        views: number of other views than the prior's that were searched.
+        evidence: the numbers behind it.
         milliseconds: wall time of each stage by name, with "total".
-        correspondences: pixels of the inliers (photo, last render), of the photo without distortion.
-        last_render: the last render that was matched, for pictures.
     """
 
     status: Status
     reason: str
     T_map_camera: np.ndarray | None = None
     covariance: np.ndarray | None = None
-    matches: int = 0
-    inliers: int = 0
-    inlier_ratio: float = float("nan")
-    coverage: float = 0.0
-    agreement: float = float("nan")
-    reprojection_error: float = float("nan")
-    passes: int = 0
-    views: int = 0
+    evidence: Evidence = field(default_factory=Evidence)
     milliseconds: dict[str, float] = field(default_factory=dict)
-    correspondences: Matches | None = None
-    last_render: Render | None = None
 
     @property
     def localized(self) -> bool:
         """Whether there is a pose to use."""
         return self.status is Status.LOCALIZED
+
+
+@dataclass(frozen=True, eq=False)
+class Trace:
+    """An estimate with the pictures that it was made from, to look at.
+
+    Attributes:
+        estimate: the answer.
+        photo: the photo, undistorted and resized.
+        render: the last render that was compared with the photo; None where there was none. Of an answer, it is within
+            half a pixel of the estimate, and of the photo's size.
+        correspondences: pixels of the inliers (photo, render).
+    """
+
+    estimate: Estimate
+    photo: Photo
+    render: Render | None = None
+    correspondences: Matches = field(default_factory=Matches.none)

@@ -1,28 +1,32 @@
-"""One view of the map compared with the photo: the step that localization repeats."""
+"""One photo compared with views of the map: the step that localization repeats."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Sized
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.geometry import invert, transform
+from gsfeatloc_ros.common.photo import Photo
 from gsfeatloc_ros.common.stage_clock import StageClock
-from gsfeatloc_ros.match.base import Features, Matcher, Matches, Tracker
+from gsfeatloc_ros.localize.options import LocalizerOptions
+from gsfeatloc_ros.match.base import Matcher, Matches, Tracker
 from gsfeatloc_ros.pose.lift import lift
-from gsfeatloc_ros.pose.solve import PoseSolution, solve_pose
+from gsfeatloc_ros.pose.solve import Correspondences, PoseSolution, solve_pose
 from gsfeatloc_ros.render.base import Render, Renderer
 
 
 @dataclass(frozen=True, eq=False)
 class MatchedView:
-    """A view, matched with the photo and solved.
+    """A view of the map, matched with the photo and solved.
 
     Attributes:
         pose: (4, 4) T_map_camera of the view.
         render: the map as seen there.
-        matches: how many pixels of the photo were found in the render.
+        matches: number of the photo's pixels that were found in the render.
         lifted_matches: those whose render pixel has a depth.
         points: (M, 3) map points of `lifted_matches`.
         solution: the photo's pose from them, None where they agree on none.
@@ -42,72 +46,93 @@ class MatchedView:
 
     @property
     def correspondences(self) -> Matches:
-        """The matches (inliers) that agree with the solution, which must exist."""
-        return self.lifted_matches.select(self.solution.inliers)
+        """The matches that agree with the solution; none without one."""
+        return self.lifted_matches.select(self.solution.inliers) if self.solution else Matches.none()
 
     def offset(self, camera: Camera) -> float:
-        """How far, in pixels, this view is from the photo's: the median distance between the inliers here and there.
+        """Return how far, in pixels, this view is from the photo's; infinite without a solution.
 
-        The solution must exist.
+        It is the median distance between where the inliers' points are seen from here and from the solution.
         """
+        if self.solution is None:
+            return float("inf")
         points = self.points[self.solution.inliers]
         here, there = (camera.project(transform(invert(T), points)) for T in (self.pose, self.solution.T_map_camera))
         return float(np.median(np.linalg.norm(here - there, axis=1)))
 
 
-def match_view(
-    renderer: Renderer,
-    matcher: Matcher,
-    query: Features,
-    camera: Camera,
-    pose: np.ndarray,
-    max_error: float,
-    seed: int,
-    clock: StageClock,
-) -> MatchedView:
-    """Render the map at `pose`, match its features with the photo's, lift the matches and solve for the photo's pose.
+@dataclass(frozen=True, eq=False)
+class Components:
+    """What localizers are made of.
 
-    Args:
-        renderer, matcher: of the map and of features.
-        query: features of the photo.
-        camera: of the photo, without distortion.
-        pose: (4, 4) T_map_camera of the view.
-        max_error: reprojection error in pixels up to which a match agrees with a pose.
-        seed: of RANSAC.
-        clock: on which the stages are counted.
+    Attributes:
+        renderer: of the map.
+        matcher: of features.
+        create_tracker: makes the tracker of a photo for renders that lie on a device.
+        options: settings.
     """
-    with clock.stage("render"):
-        render = renderer.render(camera, pose)
-    with clock.stage("features"):
-        features = matcher.features(render.device_image())
-    with clock.stage("match"):
-        matches = matcher.match(query, features)
-    return _solve_view(render, matches, camera, pose, max_error, seed, clock)
+
+    renderer: Renderer
+    matcher: Matcher
+    create_tracker: Callable[[Photo, str], Tracker]
+    options: LocalizerOptions
 
 
-def track_view(
-    renderer: Renderer,
-    tracker: Tracker,
-    camera: Camera,
-    pose: np.ndarray,
-    max_error: float,
-    seed: int,
-    clock: StageClock,
-) -> MatchedView:
-    """The same where `pose` is nearly the photo's: the photo's corners are tracked to the render, not matched."""
-    with clock.stage("render"):
-        render = renderer.render(camera, pose)
-    with clock.stage("track"):
-        matches = tracker.track(render.device_image())
-    return _solve_view(render, matches, camera, pose, max_error, seed, clock)
+@dataclass(frozen=True, eq=False)
+class Query:
+    """A photo that is being localized.
 
+    Attributes:
+        components: what it is localized with.
+        photo: without distortion, of the size at which it is compared.
+        clock: counts the time of the stages.
+    """
 
-def _solve_view(
-    render: Render, matches: Matches, camera: Camera, pose: np.ndarray, max_error: float, seed: int, clock: StageClock
-) -> MatchedView:
-    with clock.stage("solve"):
-        lifted = lift(render, camera, pose, matches.b)
-        lifted_matches = matches.select(lifted.valid)
-        points, sigmas = lifted.points[lifted.valid], lifted.sigmas[lifted.valid]
-        solution = solve_pose(camera, lifted_matches.a, points, sigmas, max_error, seed)
-    return MatchedView(pose, render, len(matches), lifted_matches, points, solution)
+    components: Components
+    photo: Photo
+    clock: StageClock
+
+    def limited(self, max_width: int) -> Query:
+        """Return the query of the same photo, at most `max_width` pixels wide."""
+        return replace(self, photo=self.photo.limited(max_width))
+
+    @cached_property
+    def features(self) -> Sized:
+        """The photo's features, as the matcher gives them."""
+        return self.components.matcher.features(self.photo.image)
+
+    @cached_property
+    def tracker(self) -> Tracker:
+        """The tracker of the photo's corners; made when there is an estimate to track from."""
+        with self.clock.stage("track"):
+            return self.components.create_tracker(self.photo, self.components.renderer.device)
+
+    def match(self, pose: np.ndarray) -> MatchedView:
+        """Render the map at a pose (4, 4), match its features with the photo's, lift the matches and solve."""
+        matcher = self.components.matcher
+        render = self._render(pose)
+        with self.clock.stage("features"):
+            features = matcher.features(render.device_image())
+        with self.clock.stage("match"):
+            matches = matcher.match(self.features, features)
+        return self._solve(pose, render, matches)
+
+    def track(self, pose: np.ndarray) -> MatchedView:
+        """Do the same where the pose is nearly the photo's: track the photo's corners to the render instead."""
+        tracker, render = self.tracker, self._render(pose)
+        with self.clock.stage("track"):
+            matches = tracker.track(render.device_image())
+        return self._solve(pose, render, matches)
+
+    def _render(self, pose: np.ndarray) -> Render:
+        with self.clock.stage("render"):
+            return self.components.renderer.render(self.photo.camera, pose)
+
+    def _solve(self, pose: np.ndarray, render: Render, matches: Matches) -> MatchedView:
+        options, camera = self.components.options, self.photo.camera
+        with self.clock.stage("solve"):
+            lifted = lift(render, camera, pose, matches.b, options.lift)
+            lifted_matches = matches.select(lifted.valid)
+            found = Correspondences(lifted_matches.a, lifted.points[lifted.valid], lifted.sigmas[lifted.valid])
+            solution = solve_pose(camera, found, options.pose, options.seed)
+        return MatchedView(pose, render, len(matches), lifted_matches, found.points, solution)

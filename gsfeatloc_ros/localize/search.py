@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
-from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.geometry import make_pose, so3_exp
-from gsfeatloc_ros.common.stage_clock import StageClock
-from gsfeatloc_ros.localize.query import MatchedView, match_view
-from gsfeatloc_ros.match.base import Features, Matcher
-from gsfeatloc_ros.render.base import Renderer
+from gsfeatloc_ros.localize.query import MatchedView, Query
 
 # Matches that agree on a pose, by which a view suggests it. Chance makes some agree too: the map is looked at from the
 # pose of a hint that is not strong, and has to confirm it.
@@ -19,48 +17,33 @@ CONFIRMED_HINT = 12
 # Views are matched with the photo at this width: it is cheap, and what it finds is refined afterwards.
 SEARCH_WIDTH = 320
 # Of the views that are looked at together, the best of this many are followed.
-_FOLLOWED = 2
+_MAX_FOLLOWED_VIEWS = 2
 # Views are chosen from this many random ones for each that is looked at.
-_DRAWN = 16
+_CANDIDATES_PER_VIEW = 16
 # Nothing is searched farther out than this, in standard deviations of all six coordinates together: 90 % lie within.
-_REACH = 3.26
+_MAX_DEVIATION = 3.26
 
 
-def look(
-    renderer: Renderer,
-    matcher: Matcher,
-    query: Features,
-    camera: Camera,
-    poses: list[np.ndarray],
-    max_error: float,
-    seed: int,
-    clock: StageClock,
-) -> list[MatchedView]:
-    """Look at the map from `poses`, in small renders, and sort the views by what they have in common with the photo.
+def look(query: Query, poses: Sequence[np.ndarray]) -> list[MatchedView]:
+    """Match a photo with views of the map and sort these by what they have in common with it.
 
     Args:
-        renderer, matcher: of the map and of features.
-        query: features of the photo, resized to at most SEARCH_WIDTH.
-        camera: of the photo at that size, without distortion.
+        query: the photo, at most SEARCH_WIDTH wide.
         poses: (4, 4) each, T_map_camera of the views.
-        max_error: reprojection error in pixels of the small image up to which a match agrees with a pose.
-        seed: of RANSAC.
-        clock: on which the stages of the views are counted.
 
     Returns:
         The views, those with the most inliers first.
     """
-    views = [match_view(renderer, matcher, query, camera, pose, max_error, seed, clock) for pose in poses]
-    return sorted(views, key=lambda view: view.inliers, reverse=True)
+    return sorted((query.match(pose) for pose in poses), key=lambda view: view.inliers, reverse=True)
 
 
-def promising(views: list[MatchedView]) -> list[MatchedView]:
-    """Of views that were looked at together and sorted, those whose poses of the photo are worth following."""
-    return [view for view in views[:_FOLLOWED] if view.inliers >= MIN_HINT]
+def promising(views: Sequence[MatchedView]) -> list[MatchedView]:
+    """Return those of views that were looked at together and sorted whose poses of the photo are worth following."""
+    return [view for view in views[:_MAX_FOLLOWED_VIEWS] if view.inliers >= MIN_HINT]
 
 
 def spread_poses(
-    T_map_camera: np.ndarray, covariance: np.ndarray, apart: np.ndarray, count: int, seed: int
+    T_map_camera: np.ndarray, covariance: np.ndarray, min_step: np.ndarray, count: int, seed: int
 ) -> list[np.ndarray]:
     """Choose up to `count` poses (4, 4) spread over the uncertainty (6, 6) of a pose, the likely ones first.
 
@@ -70,13 +53,14 @@ def spread_poses(
     Args:
         T_map_camera: (4, 4).
         covariance: (6, 6), ROS order (x y z, rotation about x y z), axes of the map frame, map units and radians.
-        apart: (6,) how far from each other poses have to be in each coordinate, all together, to show something else.
+        min_step: (6,) how far from each other poses have to be in each coordinate, all together, to show something
+            else.
         count: most poses.
         seed: the same seed gives the same poses.
     """
     rng = np.random.default_rng(seed)
-    normal = rng.normal(size=(_DRAWN * count, 6))
-    normal = normal[np.linalg.norm(normal, axis=1) <= _REACH]
+    normal = rng.normal(size=(_CANDIDATES_PER_VIEW * count, 6))
+    normal = normal[np.linalg.norm(normal, axis=1) <= _MAX_DEVIATION]
     values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
     root = vectors * np.sqrt(np.clip(values, 0.0, None))
     distance = np.linalg.norm(normal, axis=1)
@@ -88,6 +72,6 @@ def spread_poses(
     chosen.sort(key=np.linalg.norm)
     steps = [np.zeros(6)]
     for step in (root @ point for point in chosen):
-        if min(np.linalg.norm((step - other) / apart) for other in steps) >= 1:
+        if min(np.linalg.norm((step - other) / min_step) for other in steps) >= 1:
             steps.append(step)
     return [make_pose(so3_exp(step[3:]) @ T_map_camera[:3, :3], T_map_camera[:3, 3] + step[:3]) for step in steps[1:]]

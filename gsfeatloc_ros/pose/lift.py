@@ -11,14 +11,23 @@ from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.geometry import transform
 from gsfeatloc_ros.render.base import Render
 
-# A pixel is lifted where its four neighbours are covered by splats and lie on one surface: the largest step of depth
-# between them, relative to the depth, tells a slope from an edge.
-MIN_ALPHA = 0.8
-MAX_DEPTH_STEP = 0.1
 # The splats of a pixel lie scattered round the surface, and their median is closer to it than they are. A floater far
 # in front of the surface spreads the depths without moving the median: the spread counts up to this share of the depth.
 DEPTH_SIGMA_PER_STD = 0.3
 MAX_DEPTH_STD = 0.1
+
+
+@dataclass(frozen=True)
+class LiftOptions:
+    """Where a pixel is lifted: where its four neighbours are covered by splats and lie on one surface.
+
+    Attributes:
+        min_alpha: least coverage of each neighbour.
+        max_depth_step: largest step of depth between them, relative to the depth: it tells a slope from an edge.
+    """
+
+    min_alpha: float = 0.8
+    max_depth_step: float = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +45,7 @@ class Lifted:
     valid: np.ndarray
 
 
-def lift(render: Render, camera: Camera, T_map_camera: np.ndarray, pixels: np.ndarray) -> Lifted:
+def lift(render: Render, camera: Camera, T_map_camera: np.ndarray, pixels: np.ndarray, options: LiftOptions) -> Lifted:
     """Lift pixels (M, 2) of `render`, drawn with `camera` at `T_map_camera` (4, 4), by bilinear median depth.
 
     The median, not the mean: semi-transparent floaters between the camera and the surface drag the mean along.
@@ -56,9 +65,8 @@ def lift(render: Render, camera: Camera, T_map_camera: np.ndarray, pixels: np.nd
     depth = (weights * depths).sum(axis=1)
     depth_std = np.minimum((weights * depth_stds).sum(axis=1), MAX_DEPTH_STD * depth)
     # Comparisons with NaN are false: what has no depth is not valid.
-    valid = (
-        inside & (alphas.min(axis=1) >= MIN_ALPHA) & (depths.max(axis=1) - depths.min(axis=1) <= MAX_DEPTH_STEP * depth)
-    )
+    one_surface = depths.max(axis=1) - depths.min(axis=1) <= options.max_depth_step * depth
+    valid = inside & (alphas.min(axis=1) >= options.min_alpha) & one_surface
     depth = np.where(valid, depth, np.nan)
     rays = camera.rays(pixels)
     points = transform(T_map_camera, rays * depth[:, None])

@@ -6,12 +6,14 @@ PoseLib was chosen over OpenCV's USAC by measurement: `python -m gsfeatloc_ros.t
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import poselib
 
 from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.geometry import invert, make_pose, skew, so3_exp
+from gsfeatloc_ros.common.parameter import parameter
 
 _MIN_ITERATIONS, _MAX_ITERATIONS = 200, 10_000
 # A P3P sample and one match to choose among its solutions; under-determined sets have no covariance.
@@ -19,14 +21,46 @@ MIN_POINTS = 4
 # Keypoints are no better than this, however well a few of them happen to agree.
 _MIN_PIXEL_SIGMA = 0.1
 _REFINE_ITERATIONS = 20
-# In standard deviations. Real residuals have longer tails than a Gaussian's, so the loss is narrow.
-CAUCHY_SCALE = 1.0
 # What matches have in common (errors of the map, of its poses, of the calibration) does not average out over them: an
 # error of this many pixels that all share. Fitted on real photos; docs/trust.md.
 _SHARED_PIXEL_SIGMA = 0.1
 _NOISE_ITERATIONS = 5
 # A step that lowers the cost by less than this share ends the refinement: a thousandth of a standard deviation is left.
 _CONVERGED = 1e-7
+
+
+@dataclass(frozen=True)
+class PoseOptions:
+    """How a pose is solved for.
+
+    Attributes:
+        cauchy_scale: of the robust loss, in standard deviations. Real residuals have longer tails than a Gaussian's, so
+            it is narrow.
+    """
+
+    max_reprojection_error: float = parameter(
+        3.0, "Pixels of the resized image within which a corner agrees with a pose.", (0.1, 50.0), live=True
+    )
+    cauchy_scale: float = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Correspondences:
+    """Pixels of a photo and the points of the map that are seen there.
+
+    Attributes:
+        pixels: (M, 2) undistorted.
+        points: (M, 3) in the map frame.
+        sigmas: (M, 3) one standard deviation of each point along the ray it was lifted on, map frame.
+    """
+
+    pixels: np.ndarray
+    points: np.ndarray
+    sigmas: np.ndarray
+
+    def select(self, kept: np.ndarray) -> Correspondences:
+        """Return those that a mask (M,) or indices name."""
+        return Correspondences(self.pixels[kept], self.points[kept], self.sigmas[kept])
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,41 +82,41 @@ class PoseSolution:
     reprojection_error: float
 
 
-def solve_pose(
-    camera: Camera, pixels: np.ndarray, points: np.ndarray, sigmas: np.ndarray, max_error: float, seed: int
-) -> PoseSolution | None:
-    """Find the pose from which `points` are seen at `pixels`.
+def solve_pose(camera: Camera, found: Correspondences, options: PoseOptions, seed: int) -> PoseSolution | None:
+    """Find the pose from which the points are seen at the pixels.
 
     Args:
         camera: pinhole intrinsics; its distortion is ignored.
-        pixels: (M, 2) undistorted.
-        points: (M, 3) in the map frame.
-        sigmas: (M, 3) one standard deviation of each point along the ray it was lifted on, map frame.
-        max_error: reprojection error in pixels up to which a match is an inlier.
+        found: correspondences.
+        options: of the solver.
         seed: of RANSAC's sampling.
 
     Returns:
         The solution, or None where fewer than MIN_POINTS matches agree on a pose.
     """
-    found = ransac_pose(camera, pixels, points, max_error, seed)
-    if found is None:
+    sampled = ransac_pose(camera, found, options.max_reprojection_error, seed)
+    if sampled is None:
         return None
-    start, inliers = found
-    T_map_camera, covariance = refine_pose(camera, start, pixels[inliers], points[inliers], sigmas[inliers])
-    if T_map_camera is None:
+    start, inliers = sampled
+    refined = refine_pose(camera, start, found.select(inliers), options.cauchy_scale)
+    if refined is None:
         return None
-    errors = reprojection_errors(camera, T_map_camera, pixels, points)
-    inliers = errors <= max_error
+    T_map_camera, covariance = refined
+    errors = reprojection_errors(camera, T_map_camera, found)
+    inliers = errors <= options.max_reprojection_error
     if inliers.sum() < MIN_POINTS:
         return None
     return PoseSolution(T_map_camera, covariance, errors, inliers, float(np.sqrt(np.mean(errors[inliers] ** 2))))
 
 
 def ransac_pose(
-    camera: Camera, pixels: np.ndarray, points: np.ndarray, max_error: float, seed: int
+    camera: Camera, found: Correspondences, max_error: float, seed: int
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """LO-RANSAC with P3P: the pose T_map_camera (4, 4) and its inliers (M,) bool, or None; args of `solve_pose`."""
-    if len(pixels) < MIN_POINTS:
+    """Run LO-RANSAC with P3P: return the pose T_map_camera (4, 4) and its inliers (M,) bool, or None.
+
+    `max_error` is the reprojection error in pixels up to which a match is an inlier; the others as in `solve_pose`.
+    """
+    if len(found.pixels) < MIN_POINTS:
         return None
     pinhole = {
         "model": "PINHOLE",
@@ -96,7 +130,7 @@ def ransac_pose(
         "max_iterations": _MAX_ITERATIONS,
         "seed": seed,
     }
-    pose, info = poselib.estimate_absolute_pose(pixels, points, pinhole, ransac, {})
+    pose, info = poselib.estimate_absolute_pose(found.pixels, found.points, pinhole, ransac, {})
     inliers = np.asarray(info["inliers"], dtype=bool)
     T_camera_map = make_pose(pose.R, pose.t)
     if inliers.sum() < MIN_POINTS or not np.isfinite(T_camera_map).all():
@@ -104,107 +138,118 @@ def ransac_pose(
     return invert(T_camera_map), inliers
 
 
-def reprojection_errors(camera: Camera, T_map_camera: np.ndarray, pixels: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Distances (M,) in pixels between `pixels` (M, 2) and the projected `points` (M, 3); inf behind the camera."""
-    in_camera = (points - T_map_camera[:3, 3]) @ T_map_camera[:3, :3]
-    errors = np.full(len(points), np.inf)
+def reprojection_errors(camera: Camera, T_map_camera: np.ndarray, found: Correspondences) -> np.ndarray:
+    """Return the distances (M,) in pixels between the pixels and the projected points; inf behind the camera."""
+    in_camera = (found.points - T_map_camera[:3, 3]) @ T_map_camera[:3, :3]
+    errors = np.full(len(found.points), np.inf)
     ahead = in_camera[:, 2] > 0
-    errors[ahead] = np.linalg.norm(camera.project(in_camera[ahead]) - pixels[ahead], axis=1)
+    errors[ahead] = np.linalg.norm(camera.project(in_camera[ahead]) - found.pixels[ahead], axis=1)
     return errors
 
 
 def refine_pose(
-    camera: Camera, T_map_camera: np.ndarray, pixels: np.ndarray, points: np.ndarray, sigmas: np.ndarray
-) -> tuple[np.ndarray, np.ndarray] | tuple[None, None]:
-    """Levenberg-Marquardt on the reprojection errors, whitened, with Cauchy's loss.
+    camera: Camera, T_map_camera: np.ndarray, found: Correspondences, cauchy_scale: float
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Refine a pose by Levenberg-Marquardt on the reprojection errors, whitened, with Cauchy's loss.
 
     A residual's covariance is the keypoints' noise, measured on the residuals, plus the projection of the point's own
     uncertainty along the ray on which it was lifted.
 
-    Args and shapes as for `solve_pose`; `T_map_camera` is where to start.
+    Args:
+        camera: pinhole intrinsics.
+        T_map_camera: (4, 4) where to start.
+        found: correspondences, all taken for right.
+        cauchy_scale: of the loss, in standard deviations.
 
     Returns:
         The refined pose (4, 4) and its covariance (6, 6): the inverse of the Hessian, inflated by the
         residuals' scale, and the share of errors that the matches have in common.
-        (None, None) where a point falls behind the camera or the matches do not determine the pose.
+        None where a point falls behind the camera or the matches do not determine the pose.
     """
     pose = T_map_camera
     damping = 1e-4
-    residuals, jacobian, point_jacobian = _linearize(camera, pose, pixels, points)
-    if residuals is None:
-        return None, None
-    whitening = _whitening(residuals, _apply(point_jacobian, sigmas))
+    linear = _linearize(camera, pose, found)
+    if linear is None:
+        return None
+    whitening = _whitening(linear.residuals, _apply(linear.by_point, found.sigmas))
 
     def cost(residuals: np.ndarray) -> float:
-        return float(np.log1p((_apply(whitening, residuals) ** 2).sum(axis=1) / CAUCHY_SCALE**2).sum())
+        return float(np.log1p((_apply(whitening, residuals) ** 2).sum(axis=1) / cauchy_scale**2).sum())
 
-    current = cost(residuals)
+    current = cost(linear.residuals)
     for _ in range(_REFINE_ITERATIONS):
-        hessian, gradient = _normal_equations(whitening, residuals, jacobian)
+        hessian, gradient = _normal_equations(whitening, linear, cauchy_scale)
         try:
             step = np.linalg.solve(hessian + damping * np.diag(np.diag(hessian)), -gradient)
         except np.linalg.LinAlgError:
-            return None, None
+            return None
         candidate = make_pose(so3_exp(step[3:]) @ pose[:3, :3], pose[:3, 3] + step[:3])
-        linearized = _linearize(camera, candidate, pixels, points)
-        if linearized[0] is None or (cost_there := cost(linearized[0])) > current:
+        linear_there = _linearize(camera, candidate, found)
+        if linear_there is None or (cost_there := cost(linear_there.residuals)) > current:
             damping *= 10
             continue
         converged = current - cost_there <= _CONVERGED * current
-        pose, current, damping = candidate, cost_there, damping / 10
-        residuals, jacobian, _ = linearized
+        pose, current, damping, linear = candidate, cost_there, damping / 10, linear_there
         if converged:
             break
 
-    hessian, _ = _normal_equations(whitening, residuals, jacobian)
+    hessian, _ = _normal_equations(whitening, linear, cauchy_scale)
     try:
         covariance = np.linalg.inv(hessian)
     except np.linalg.LinAlgError:
-        return None, None
+        return None
     if not (np.isfinite(covariance).all() and np.linalg.eigvalsh(covariance)[0] > 0):
-        return None, None
-    squared = (_apply(whitening, residuals) ** 2).sum(axis=1)
-    weights = _cauchy_weights(squared)
+        return None
+    squared = (_apply(whitening, linear.residuals) ** 2).sum(axis=1)
+    weights = _cauchy_weights(squared, cauchy_scale)
     degrees_of_freedom = max(2 * weights.sum() - 6, 1.0)
     inflation = max((weights * squared).sum() / degrees_of_freedom, 1.0)
-    weighted = (weights[:, None, None] * jacobian).reshape(-1, 6)
-    information_of_a_match = weighted.T @ jacobian.reshape(-1, 6) / weights.sum()
+    weighted = (weights[:, None, None] * linear.by_pose).reshape(-1, 6)
+    information_of_a_match = weighted.T @ linear.by_pose.reshape(-1, 6) / weights.sum()
     shared = _SHARED_PIXEL_SIGMA**2 * np.linalg.inv(information_of_a_match)
     return pose, covariance * inflation + shared
 
 
-def _linearize(camera: Camera, pose: np.ndarray, pixels: np.ndarray, points: np.ndarray):
-    """Residuals (M, 2), their Jacobians (M, 2, 6) by (translation, rotation) of the pose, and (M, 2, 3) by the point.
+class _Linear(NamedTuple):
+    """Residuals (M, 2), and their Jacobians (M, 2, 6) by (translation, rotation) of the pose, (M, 2, 3) by the point.
 
-    The pose moves as t + dt, exp(dr) R, both in the map frame. All None where a point is not ahead of the camera.
+    The pose moves as t + dt, exp(dr) R, both in the map frame.
     """
-    offsets = points - pose[:3, 3]
+
+    residuals: np.ndarray
+    by_pose: np.ndarray
+    by_point: np.ndarray
+
+
+def _linearize(camera: Camera, pose: np.ndarray, found: Correspondences) -> _Linear | None:
+    """Return the residuals at a pose (4, 4) and their Jacobians; None where a point is not ahead of the camera."""
+    offsets = found.points - pose[:3, 3]
     in_camera = offsets @ pose[:3, :3]
     z = in_camera[:, 2:]
     if not (z > 0).all():
-        return None, None, None
+        return None
     homogeneous = in_camera @ camera.K.T
     # The quotient rule, for u and v: (K_r - pixel e_z) / z.
     by_camera_point = camera.K[:2] / z[..., None]
     projected = homogeneous[:, :2] / z
     by_camera_point[:, :, 2] -= projected / z
     by_point = by_camera_point @ pose[:3, :3].T
-    jacobian = np.concatenate([-by_point, by_point @ skew(offsets)], axis=2)
-    return projected - pixels, jacobian, by_point
+    by_pose = np.concatenate([-by_point, by_point @ skew(offsets)], axis=2)
+    return _Linear(projected - found.pixels, by_pose, by_point)
 
 
-def _normal_equations(whitening: np.ndarray, residuals: np.ndarray, jacobian: np.ndarray):
-    """Hessian (6, 6) and gradient (6,) of the Cauchy-weighted problem (iteratively reweighted least squares)."""
-    white_residuals = _apply(whitening, residuals)
-    white_jacobian = whitening @ jacobian
-    weights = _cauchy_weights((white_residuals**2).sum(axis=1))
+def _normal_equations(whitening: np.ndarray, linear: _Linear, cauchy_scale: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return Hessian (6, 6) and gradient (6,) of the Cauchy-weighted problem (iteratively reweighted least squares)."""
+    white_residuals = _apply(whitening, linear.residuals)
+    white_jacobian = whitening @ linear.by_pose
+    weights = _cauchy_weights((white_residuals**2).sum(axis=1), cauchy_scale)
     weighted = (white_jacobian * weights[:, None, None]).reshape(-1, 6)
     return weighted.T @ white_jacobian.reshape(-1, 6), weighted.T @ white_residuals.ravel()
 
 
-def _cauchy_weights(squared: np.ndarray) -> np.ndarray:
-    """Weights (M,) of residuals by their squared whitened lengths (M,)."""
-    return 1.0 / (1.0 + squared / CAUCHY_SCALE**2)
+def _cauchy_weights(squared: np.ndarray, scale: float) -> np.ndarray:
+    """Return the weights (M,) of residuals by their squared whitened lengths (M,)."""
+    return 1.0 / (1.0 + squared / scale**2)
 
 
 def _whitening(residuals: np.ndarray, smears: np.ndarray) -> np.ndarray:

@@ -1,0 +1,77 @@
+"""Settings as fields of frozen dataclasses, each described once.
+
+What a field is for, its range and its choices stand beside its default. The node's parameters, config/localizer.yaml,
+docs/parameters.md and the tools' options are made from that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from typing import Any, TypeVar, cast
+
+T = TypeVar("T")
+Settings = TypeVar("Settings")
+
+Value = str | bool | int | float | tuple[float, ...]
+
+_KEY = "parameter"
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A setting.
+
+    Attributes:
+        name: with dots between the groups.
+        default: its type is the parameter's type.
+        description: what it does, with the unit.
+        bounds: lowest and highest value of a single number; None for texts, booleans and lists.
+        choices: the values that a text may have; empty for any.
+        live: whether it can be set while the node runs; otherwise only when it starts.
+    """
+
+    name: str
+    default: Value
+    description: str
+    bounds: tuple[float, float] | None = None
+    choices: tuple[str, ...] = ()
+    live: bool = False
+
+    def check(self, value: Value) -> None:
+        """Raise ValueError where `value` is not one of the choices."""
+        if self.choices and value not in self.choices:
+            raise ValueError(f"parameter {self.name}: {value!r} is not one of {', '.join(self.choices)}")
+
+
+def parameter(
+    default: T,
+    description: str,
+    bounds: tuple[float, float] | None = None,
+    choices: tuple[str, ...] = (),
+    live: bool = False,
+) -> T:
+    """Make a dataclass field that is a parameter; arguments as the attributes of Parameter."""
+    about = Parameter("", cast(Value, default), description, bounds, choices, live)
+    return cast(T, field(default=default, metadata={_KEY: about}))
+
+
+def parameters_of(settings: type, prefix: str = "") -> Iterator[Parameter]:
+    """Yield the parameters of a dataclass, and those of the fields that are dataclasses themselves, under `prefix`."""
+    for item in fields(settings):
+        if _KEY in item.metadata:
+            yield replace(item.metadata[_KEY], name=prefix + item.name)
+        elif is_dataclass(item.default_factory):
+            yield from parameters_of(cast(type, item.default_factory), prefix)
+
+
+def settings_from(settings: type[Settings], values: Mapping[str, Value], prefix: str = "") -> Settings:
+    """Make a settings dataclass of parameter values by name; those that are not there have their defaults."""
+    arguments: dict[str, Any] = {}
+    for item in fields(cast(Any, settings)):
+        if _KEY in item.metadata:
+            if prefix + item.name in values:
+                arguments[item.name] = values[prefix + item.name]
+        elif is_dataclass(item.default_factory):
+            arguments[item.name] = settings_from(cast(type, item.default_factory), values, prefix)
+    return settings(**arguments)

@@ -1,0 +1,40 @@
+"""Settings of a Localizer."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from gsfeatloc_ros.common.parameter import parameter
+from gsfeatloc_ros.localize.evidence import Limits
+from gsfeatloc_ros.pose.lift import LiftOptions
+from gsfeatloc_ros.pose.solve import PoseOptions
+
+
+@dataclass(frozen=True)
+class LocalizerOptions:
+    """Settings of a Localizer; the node has them, and those of `pose` and `limits`, as parameters `localizer.*`."""
+
+    max_image_width: int = parameter(640, "Wider images are resized to this many pixels first.", (64, 16384), live=True)
+    max_passes: int = parameter(4, "Most renders at estimates to which an image is tracked.", (1, 20), live=True)
+    max_views: int = parameter(
+        32, "Most other views searched when the prior's shows nothing of the image; 0 for none.", (0, 1000), live=True
+    )
+    prior_rotation: float = parameter(
+        15.0, "Standard deviation of the prior in degrees about each axis.", (0.01, 180.0), live=True
+    )
+    prior_translation: float = parameter(
+        0.5, "Standard deviation of the prior in map units along each axis.", (1e-6, 1e6), live=True
+    )
+    seed: int = parameter(
+        0, "Seed of RANSAC and of the search: the same seed gives the same answer.", (0, 2**31 - 1), live=True
+    )
+    pose: PoseOptions = field(default_factory=PoseOptions)
+    limits: Limits = field(default_factory=Limits)
+    lift: LiftOptions = field(default_factory=LiftOptions)
+
+    def prior_covariance(self) -> np.ndarray:
+        """Covariance (6, 6) of a prior that comes without one: x y z, rotation vector; map units and radians."""
+        sigmas = [self.prior_translation] * 3 + [np.radians(self.prior_rotation)] * 3
+        return np.diag(np.square(sigmas))

@@ -1,0 +1,84 @@
+"""Settings of what a localizer is made of, by the groups of the node's parameters: map, matcher, renderer."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsfeatloc_ros.common.device import DEVICES
+from gsfeatloc_ros.common.geometry import matrix_from_quaternion
+from gsfeatloc_ros.common.parameter import parameter
+from gsfeatloc_ros.maps import Similarity, read_dataparser_transforms
+from gsfeatloc_ros.match import DEFAULT_MATCHER, DEFAULT_MAX_FEATURES, MATCHERS
+
+
+@dataclass(frozen=True)
+class MapSettings:
+    """Which map, and where it lies."""
+
+    path: str = parameter(
+        "",
+        "Path of the map (required): "
+        "a .ply, compressed .ply, .splat, .spz or .sog, or the folder of an unbundled .sog.",
+        live=True,
+    )
+    frame_id: str = parameter("map", "Name of the map's frame, in which answers are given.")
+    aligned: bool = parameter(False, "Whether that is the robot's map frame (metres, z up): publish_tf needs it.")
+    scale: float = parameter(1.0, "Units of the map frame in one unit of the file.", (1e-6, 1e6))
+    translation: tuple[float, ...] = parameter(
+        (0.0, 0.0, 0.0), "Where the file's origin lies in the map frame: x, y, z."
+    )
+    rotation: tuple[float, ...] = parameter(
+        (0.0, 0.0, 0.0, 1.0), "Quaternion x, y, z, w that turns the file's axes into the map frame's."
+    )
+    dataparser_transforms: str = parameter(
+        "", "Path of nerfstudio's dataparser_transforms.json, undone before the three above; empty for none."
+    )
+    cache: bool = parameter(
+        True, "Keep the map, prepared for rendering, in a file beside it (*.gsfeatloc-cache): later starts are faster."
+    )
+
+    def alignment(self) -> Similarity:
+        """Return where the frame of the map's file lies in the robot's map frame (S_map_splat).
+
+        Raises:
+            ValueError: a parameter is no translation, no quaternion or no file of nerfstudio's; the message says which.
+        """
+        translation = _numbers("map.translation", self.translation, 3)
+        try:
+            rotation = matrix_from_quaternion(_numbers("map.rotation", self.rotation, 4))
+        except ValueError as error:
+            raise ValueError(f"parameter map.rotation: {error}") from error
+        alignment = Similarity(self.scale, rotation, translation)
+        if not self.dataparser_transforms:
+            return alignment
+        return alignment @ read_dataparser_transforms(self.dataparser_transforms)
+
+
+@dataclass(frozen=True)
+class MatcherSettings:
+    """Which features."""
+
+    name: str = parameter(DEFAULT_MATCHER, f"Feature matcher: {', '.join(MATCHERS)}.", choices=tuple(MATCHERS))
+    weights: str = parameter(
+        "", "Path of a learned matcher's weights (two networks: of their folder); empty looks in the usual places."
+    )
+    max_features: int = parameter(DEFAULT_MAX_FEATURES, "Most features taken from an image.", (64, 32768))
+
+
+@dataclass(frozen=True)
+class RendererSettings:
+    """What draws the map, and how."""
+
+    device: str = parameter("auto", "Where to render, match and track: cpu, cuda, or auto to choose.", choices=DEVICES)
+    threads: int = parameter(0, "Threads of the CPU renderer; 0 takes all cores.", (0, 1024))
+    sh_degree: int = parameter(3, "Highest degree of the spherical harmonics of the colours drawn.", (0, 3))
+    resolution_scale: float = parameter(1.0, "Draw so many times the width and height, and enlarge that.", (0.1, 1.0))
+
+
+def _numbers(name: str, values: tuple[float, ...], count: int) -> np.ndarray:
+    numbers = np.array(values, dtype=np.float64)
+    if numbers.shape != (count,) or not np.isfinite(numbers).all():
+        raise ValueError(f"parameter {name}: {numbers.tolist()} is not {count} finite numbers")
+    return numbers
