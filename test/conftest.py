@@ -1,4 +1,4 @@
-"""Fixtures that tests share: a simulated room, its map and its photos, and the folder of real data."""
+"""Fixtures that tests share: a simulated room, its map and its photos."""
 
 from __future__ import annotations
 
@@ -56,15 +56,6 @@ def room_camera() -> Camera:
 @pytest.fixture(scope="session")
 def room_photos(room: Room, room_camera: Camera) -> list[SimulatedPhoto]:
     return simulate_photos(room, room_camera, count=8, seed=0)
-
-
-@pytest.fixture(scope="session")
-def shared() -> Path:
-    """The folder of real maps and scenes beside the repository."""
-    path = Path(__file__).parents[2] / "shared"
-    if not path.is_dir():
-        pytest.skip(f"{path} is absent: it holds the real maps and scenes")
-    return path
 
 
 @pytest.fixture

@@ -3,9 +3,7 @@
 import json
 import shutil
 import sys
-from dataclasses import replace
 
-import cv2
 import numpy as np
 import pycolmap
 import pytest
@@ -16,7 +14,6 @@ from gsfeatloc_ros.common.geometry import make_pose, rotation_error_deg, transla
 from gsfeatloc_ros.evaluate.protocol import trajectory_radius
 from gsfeatloc_ros.evaluate.scene import load_scene
 from gsfeatloc_ros.localize.localizer import Localizer
-from gsfeatloc_ros.maps import load_map
 from gsfeatloc_ros.match import create_matcher
 from gsfeatloc_ros.render import create_renderer
 from gsfeatloc_ros.simulate import simulate_photos
@@ -346,38 +343,3 @@ def test_colmap_without_pycolmap(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     with pytest.raises(RuntimeError, match="pycolmap is needed for this and is not installed: pip install pycolmap"):
         load_scene(tmp_path, "map.ply")
-
-
-# Real scenes
-
-
-@pytest.mark.parametrize(
-    ("name", "photos", "frames", "background"),
-    [("bonsai", 37, 292, (0.0, 0.0, 0.0)), ("lego", 50, 150, (1.0, 1.0, 1.0))],
-)
-def test_real_scenes(shared, name, photos, frames, background):
-    scene = load_scene(shared / "scenes" / name)
-    assert len(scene.photos) == photos
-    assert len(scene.trajectory) == frames
-    assert scene.background == background
-    for photo in scene.photos:
-        assert scene.read_photo(photo).shape == (scene.camera.height, scene.camera.width, 3)
-
-
-@pytest.mark.parametrize("name", ["bonsai", "lego"])
-def test_photos_and_renders_lie_on_each_other_to_the_half_pixel(shared, name):
-    scene = load_scene(shared / "scenes" / name)
-    renderer = create_renderer(load_map(scene.map_path), background=scene.background)
-    width, height = scene.camera.width // 2, scene.camera.height // 2
-    photos = [(p, cv2.resize(scene.read_photo(p), (width, height), interpolation=cv2.INTER_AREA)) for p in scene.photos]
-
-    def psnr(shift):
-        K = scene.camera.K.copy()
-        K[:2, 2] += shift
-        camera = replace(scene.camera, K=K).scaled(width, height)
-        return np.mean([cv2.PSNR(image, renderer.render(camera, p.T_map_camera).image()) for p, image in photos[:6]])
-
-    right = psnr([0, 0])
-    assert right > 25
-    for shift in ([0.5, 0], [-0.5, 0], [0, 0.5], [0, -0.5]):
-        assert right > psnr(shift)

@@ -29,11 +29,8 @@ from map_files import (
     write_spz,
 )
 
-from gsfeatloc_ros.common.camera import Camera
-from gsfeatloc_ros.common.geometry import make_pose, so3_exp
 from gsfeatloc_ros.maps import GaussianMap, MapError, load_map
 from gsfeatloc_ros.maps.assemble import MAX_GAUSSIANS
-from gsfeatloc_ros.render import create_renderer
 
 # tmp_path is shared by the examples of one test: each overwrites the files.
 same_folder = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -160,73 +157,6 @@ def test_extensions_of_spz_are_passed_over(tmp_path):
     camera = struct.pack("<II3f", 0xADBE0002, 12, 0, 1, 2)
     for version in (3, 4):
         assert len(load_map(write_spz(tmp_path / "map", sample_map(3, 1, 0), version, camera, flags=2))) == 3
-
-
-# Real files
-
-
-def views(gaussian_map: GaussianMap, count: int) -> list[np.ndarray]:
-    """Poses of a camera that goes round a thing upright in the map and looks at it."""
-    center = np.median(gaussian_map.means, axis=0).astype(np.float64)
-    radius = 2.0 * np.quantile(np.linalg.norm(gaussian_map.means - center, axis=1), 0.95)
-    turns = [so3_exp(np.array([0.0, 2 * np.pi * k / count, 0.0])) for k in range(count)]
-    return [make_pose(turn, center - radius * turn[:, 2]) for turn in turns]
-
-
-@pytest.mark.parametrize(
-    ("one", "other", "decibels"),
-    [("plush_dog.ply", "plush_dog.compressed.ply", 38.0), ("biker.compressed.ply", "biker.spz", 46.0)],
-)
-def test_two_formats_of_a_scene_render_alike(shared, one, other, decibels):
-    a, b = load_map(shared / "maps" / one), load_map(shared / "maps" / other)
-    assert len(a) == len(b)
-    camera = Camera(240, 240, np.array([[240.0, 0, 119.5], [0, 240.0, 119.5], [0, 0, 1]]))
-    for pose in views(a, 4):
-        x, y = (create_renderer(m, background=(0.5, 0.5, 0.5)).render(camera, pose) for m in (a, b))
-        seen = x.alpha > 0.1
-        assert seen.mean() > 0.03
-        assert -10 * np.log10(np.mean((x.rgb[seen].astype(np.float64) - y.rgb[seen]) ** 2)) > decibels
-        both = np.isfinite(x.depth) & np.isfinite(y.depth)
-        assert np.quantile(np.abs(x.depth - y.depth)[both] / x.depth[both], 0.99) < 0.01
-
-
-def test_real_sog(shared):
-    gaussian_map = load_map(shared / "maps/playbot.sog")
-    assert len(gaussian_map) == 31000
-    assert gaussian_map.sh_degree == 2
-    # A robot that stands on the ground at the origin, one unit high; y points down, as in .ply.
-    np.testing.assert_allclose(gaussian_map.means[:, 1].min(), -1.08, atol=0.01)
-    np.testing.assert_allclose(gaussian_map.means[:, 1].max(), 0.04, atol=0.01)
-
-
-def test_real_splat(shared):
-    gaussian_map = load_map(shared / "maps/plant.splat")
-    assert len(gaussian_map) == 113_648
-    image = create_renderer(gaussian_map).render(
-        Camera(200, 200, np.array([[200.0, 0, 99.5], [0, 200.0, 99.5], [0, 0, 1]])), views(gaussian_map, 1)[0]
-    )
-    # Green leaves above a light pot.
-    top, bottom = (image.rgb[rows][image.alpha[rows] > 0.8].mean(axis=0) for rows in (slice(20, 90), slice(130, 190)))
-    assert top[1] == top.max()
-    assert bottom.mean() > 1.5 * top.mean()
-
-
-@pytest.mark.parametrize("name", ["plush_dog.compressed.ply", "biker.compressed.ply", "biker.spz", "plant.splat"])
-def test_the_name_does_not_matter(shared, tmp_path, name):
-    shutil.copy(shared / "maps" / name, tmp_path / "map.dat")
-    assert len(load_map(tmp_path / "map.dat")) == len(load_map(shared / "maps" / name))
-
-
-@pytest.mark.parametrize(
-    "name", ["plush_dog.ply", "plush_dog.compressed.ply", "biker.compressed.ply", "biker.spz", "plant.splat"]
-)
-def test_reading_takes_no_second_copy_of_the_map(shared, name):
-    tracemalloc.start()
-    gaussian_map = load_map(shared / "maps" / name)
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    block = 8192 * 4 * 200  # of temporary values, which matter in small maps alone
-    assert peak < 1.6 * array_bytes(gaussian_map) + block
 
 
 # Damage: each kind is named

@@ -129,19 +129,6 @@ def test_written_in_the_order_of_the_trainer(tmp_path):
     assert [p.name for p in written.properties] == list(stored_values(1, 3))
 
 
-@pytest.mark.parametrize(
-    ("name", "count", "degree"),
-    [("scenes/bonsai/map.ply", 68914, 1), ("scenes/lego/map.ply", 69238, 1), ("maps/plush_dog.ply", 15105, 3)],
-)
-def test_real_maps(shared, name, count, degree):
-    gaussian_map = load_map(shared / name)
-    assert len(gaussian_map) == count
-    assert gaussian_map.sh_degree == degree
-    stored = PlyData.read(str(shared / name))["vertex"]
-    np.testing.assert_allclose(gaussian_map.scales[:, 2], np.exp(stored["scale_2"]), rtol=1e-5)
-    np.testing.assert_array_equal(gaussian_map.sh[:, 1, 1], stored[f"f_rest_{(degree + 1) ** 2 - 1}"])
-
-
 # What is wrong with a file, and what the message says
 
 

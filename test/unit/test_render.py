@@ -41,18 +41,6 @@ def test_agrees_with_the_reference_at_every_sh_degree(sh_degree: int) -> None:
     assert_same(fast, ReferenceRenderer(gaussian_map, (0.2, 0.4, 0.6)).render(camera, pose), 70)
 
 
-@pytest.mark.parametrize("scene", ["scenes/bonsai/map.ply", "scenes/lego/map.ply", "maps/plush_dog.ply"])
-def test_agrees_with_the_reference_on_real_maps(shared, scene: str) -> None:
-    gaussian_map = load_map(shared / scene)
-    # From outside, looking at the middle of the map, and from within it.
-    center = np.median(gaussian_map.means, axis=0).astype(np.float64)
-    extent = np.quantile(np.linalg.norm(gaussian_map.means - center, axis=1), 0.7)
-    camera = Camera(160, 120, np.array([[130.0, 0, 79.5], [0, 130.0, 59.5], [0, 0, 1]]))
-    for pose in (make_pose(np.eye(3), center - [0, 0, 2.0 * extent]), make_pose(so3_exp(np.ones(3)), center)):
-        fast = create_renderer(gaussian_map).render(camera, pose)
-        assert_same(fast, ReferenceRenderer(gaussian_map).render(camera, pose), 70)
-
-
 @settings(max_examples=15, deadline=None)
 @given(
     seed=st.integers(0, 2**32 - 1),
@@ -404,10 +392,9 @@ def test_loading_takes_little_more_than_the_map_and_what_is_prepared_from_it(tmp
     assert 1.5 * parameters < peak <= 1.6 * parameters
 
 
-def test_a_prepared_map_renders_as_the_map_itself(shared) -> None:
-    gaussian_map = load_map(shared / "maps/plush_dog.ply")
-    pose = make_pose(np.eye(3), np.median(gaussian_map.means, axis=0).astype(np.float64) - [0, 0, 2])
-    a, b = (create_renderer(m).render(small_camera(), pose) for m in (gaussian_map, prepare(gaussian_map)))
+def test_a_prepared_map_renders_as_the_map_itself() -> None:
+    gaussian_map = random_map(3000, 3, seed=0)
+    a, b = (create_renderer(m).render(small_camera(), np.eye(4)) for m in (gaussian_map, prepare(gaussian_map)))
     assert a.alpha.max() > 0.9
     np.testing.assert_array_equal(a.rgb, b.rgb)
 
