@@ -1,10 +1,48 @@
 """Relocalization of a camera in a 3D Gaussian Splatting map, for ROS 2 and without."""
 
-import os
+from __future__ import annotations
 
-from gsfeatloc_ros.common.kernel_cache import set_kernel_cache
+import importlib
+from typing import TYPE_CHECKING, Any
 
-# Before torch and numba load OpenMP: its threads would spin while they wait for each other, which on busy cores makes
-# every call wait for the scheduler (measured: XFeat took 1500 ms instead of 50 beside one other busy process).
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-set_kernel_cache()
+if TYPE_CHECKING:
+    from gsfeatloc_ros.common.camera import Camera
+    from gsfeatloc_ros.localize.estimate import Estimate, Status
+    from gsfeatloc_ros.localize.localizer import Localizer
+    from gsfeatloc_ros.localize.options import LocalizerOptions
+    from gsfeatloc_ros.maps import load_map
+    from gsfeatloc_ros.match import create_matcher
+    from gsfeatloc_ros.render import create_renderer
+
+__all__ = [
+    "Camera",
+    "Estimate",
+    "Localizer",
+    "LocalizerOptions",
+    "Status",
+    "create_matcher",
+    "create_renderer",
+    "load_map",
+]
+
+# Where each name is. They are imported when first used: numba, torch and OpenCV take seconds.
+_MODULES = {
+    "Camera": "common.camera",
+    "Estimate": "localize.estimate",
+    "Localizer": "localize.localizer",
+    "LocalizerOptions": "localize.options",
+    "Status": "localize.estimate",
+    "create_matcher": "match",
+    "create_renderer": "render",
+    "load_map": "maps",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -18,7 +18,7 @@ from gsfeatloc_ros.common.geometry import (
     transform,
     translation_error,
 )
-from gsfeatloc_ros.pose.solve import ransac_pose
+from gsfeatloc_ros.pose.solve import Correspondences, ransac_pose
 
 _MAX_ERROR = 3.0  # pixels
 _KEYPOINT_NOISE = 0.7  # pixels
@@ -62,7 +62,8 @@ def _matches(count: int, inlier_ratio: float, seed: int) -> tuple[Camera, np.nda
 
 
 def _solve_with_poselib(camera: Camera, pixels: np.ndarray, points: np.ndarray, seed: int) -> np.ndarray | None:
-    found = ransac_pose(camera, pixels, points, _MAX_ERROR, seed)
+    matches = Correspondences(pixels, points, np.zeros_like(points))
+    found = ransac_pose(camera, matches, _MAX_ERROR, seed)
     return found[0] if found else None
 
 

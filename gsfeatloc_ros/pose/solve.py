@@ -21,9 +21,6 @@ MIN_POINTS = 4
 # Keypoints are no better than this, however well a few of them happen to agree.
 _MIN_PIXEL_SIGMA = 0.1
 _REFINE_ITERATIONS = 20
-# What matches have in common (errors of the map, of its poses, of the calibration) does not average out over them: an
-# error of this many pixels that all share. Fitted on real photos; docs/trust.md.
-_SHARED_PIXEL_SIGMA = 0.1
 _NOISE_ITERATIONS = 5
 # A step that lowers the cost by less than this share ends the refinement: a thousandth of a standard deviation is left.
 _CONVERGED = 1e-7
@@ -36,12 +33,15 @@ class PoseOptions:
     Attributes:
         cauchy_scale: of the robust loss, in standard deviations. Real residuals have longer tails than a Gaussian's, so
             it is narrow.
+        shared_error: pixels of error that all matches have in common (errors of the map, of its poses, of the
+            calibration), which does not average out over them. Fitted on real photos: docs/trust.md.
     """
 
     max_reprojection_error: float = parameter(
         3.0, "Pixels of the resized image within which a corner agrees with a pose.", (0.1, 50.0), live=True
     )
     cauchy_scale: float = 1.0
+    shared_error: float = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +98,7 @@ def solve_pose(camera: Camera, found: Correspondences, options: PoseOptions, see
     if sampled is None:
         return None
     start, inliers = sampled
-    refined = refine_pose(camera, start, found.select(inliers), options.cauchy_scale)
+    refined = refine_pose(camera, start, found.select(inliers), options)
     if refined is None:
         return None
     T_map_camera, covariance = refined
@@ -148,7 +148,7 @@ def reprojection_errors(camera: Camera, T_map_camera: np.ndarray, found: Corresp
 
 
 def refine_pose(
-    camera: Camera, T_map_camera: np.ndarray, found: Correspondences, cauchy_scale: float
+    camera: Camera, T_map_camera: np.ndarray, found: Correspondences, options: PoseOptions
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Refine a pose by Levenberg-Marquardt on the reprojection errors, whitened, with Cauchy's loss.
 
@@ -159,7 +159,7 @@ def refine_pose(
         camera: pinhole intrinsics.
         T_map_camera: (4, 4) where to start.
         found: correspondences, all taken for right.
-        cauchy_scale: of the loss, in standard deviations.
+        options: of the solver.
 
     Returns:
         The refined pose (4, 4) and its covariance (6, 6): the inverse of the Hessian, inflated by the
@@ -174,11 +174,11 @@ def refine_pose(
     whitening = _whitening(linear.residuals, _apply(linear.by_point, found.sigmas))
 
     def cost(residuals: np.ndarray) -> float:
-        return float(np.log1p((_apply(whitening, residuals) ** 2).sum(axis=1) / cauchy_scale**2).sum())
+        return float(np.log1p((_apply(whitening, residuals) ** 2).sum(axis=1) / options.cauchy_scale**2).sum())
 
     current = cost(linear.residuals)
     for _ in range(_REFINE_ITERATIONS):
-        hessian, gradient = _normal_equations(whitening, linear, cauchy_scale)
+        hessian, gradient = _normal_equations(whitening, linear, options.cauchy_scale)
         try:
             step = np.linalg.solve(hessian + damping * np.diag(np.diag(hessian)), -gradient)
         except np.linalg.LinAlgError:
@@ -193,7 +193,7 @@ def refine_pose(
         if converged:
             break
 
-    hessian, _ = _normal_equations(whitening, linear, cauchy_scale)
+    hessian, _ = _normal_equations(whitening, linear, options.cauchy_scale)
     try:
         covariance = np.linalg.inv(hessian)
     except np.linalg.LinAlgError:
@@ -201,12 +201,12 @@ def refine_pose(
     if not (np.isfinite(covariance).all() and np.linalg.eigvalsh(covariance)[0] > 0):
         return None
     squared = (_apply(whitening, linear.residuals) ** 2).sum(axis=1)
-    weights = _cauchy_weights(squared, cauchy_scale)
+    weights = _cauchy_weights(squared, options.cauchy_scale)
     degrees_of_freedom = max(2 * weights.sum() - 6, 1.0)
     inflation = max((weights * squared).sum() / degrees_of_freedom, 1.0)
     weighted = (weights[:, None, None] * linear.by_pose).reshape(-1, 6)
     information_of_a_match = weighted.T @ linear.by_pose.reshape(-1, 6) / weights.sum()
-    shared = _SHARED_PIXEL_SIGMA**2 * np.linalg.inv(information_of_a_match)
+    shared = options.shared_error**2 * np.linalg.inv(information_of_a_match)
     return pose, covariance * inflation + shared
 
 

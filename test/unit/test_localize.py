@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from asserts import assert_no_answer
 
 from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.geometry import make_pose, rotation_error_deg, so3_exp, translation_error
 from gsfeatloc_ros.localize.estimate import Status
-from gsfeatloc_ros.localize.localizer import Localizer, LocalizerOptions
+from gsfeatloc_ros.localize.evidence import Limits
+from gsfeatloc_ros.localize.localizer import Localizer
+from gsfeatloc_ros.localize.options import LocalizerOptions
 from gsfeatloc_ros.match import create_matcher
 from gsfeatloc_ros.render import create_renderer
 
@@ -43,12 +47,13 @@ def test_the_answer_carries_its_evidence(sift_localizer, room_camera, room_photo
     estimate = sift_localizer.localize(photo.image, room_camera, photo.T_map_camera_prior)
     np.testing.assert_allclose(estimate.covariance, estimate.covariance.T, rtol=1e-6)
     assert np.linalg.eigvalsh(estimate.covariance)[0] > 0
-    assert 20 <= estimate.inliers <= estimate.matches
-    assert len(estimate.correspondences) == estimate.inliers
-    assert 0 < estimate.reprojection_error < 3.0
-    assert 1 <= estimate.passes <= 4
-    assert 0.5 < estimate.agreement <= 1.0
-    assert 0.5 < estimate.coverage <= 1.0
+    evidence = estimate.evidence
+    assert 20 <= evidence.inliers <= evidence.lifted <= evidence.matches <= evidence.corners
+    assert 0 < evidence.reprojection_error_px < 3.0
+    assert 1 <= evidence.passes <= 4
+    assert 0.5 < evidence.correlation <= 1.0
+    assert 0.5 < evidence.coverage <= 1.0
+    assert 0 < evidence.deviation < 8
     assert {
         "prepare",
         "features",
@@ -56,7 +61,7 @@ def test_the_answer_carries_its_evidence(sift_localizer, room_camera, room_photo
         "match",
         "track",
         "solve",
-        "judge",
+        "verify",
         "total",
     } <= estimate.milliseconds.keys()
     stages = sum(ms for stage, ms in estimate.milliseconds.items() if stage != "total")
@@ -72,18 +77,32 @@ def test_the_same_seed_gives_the_same_answer(sift_localizer, room_camera, room_p
 def test_wide_photos_are_resized(renderer, room_camera, room_photos) -> None:
     narrow = Localizer(renderer, create_matcher("sift"), LocalizerOptions(max_image_width=480))
     photo = room_photos[2]
-    estimate = narrow.localize(photo.image, room_camera, photo.T_map_camera_prior)
-    assert estimate.last_render.rgb.shape == (360, 480, 3)
+    trace = narrow.trace(photo.image, room_camera, photo.T_map_camera_prior)
+    estimate = trace.estimate
+    assert trace.photo.image.shape == trace.render.rgb.shape == (360, 480, 3)
     assert rotation_error_deg(estimate.T_map_camera, photo.T_map_camera) < 1.0
     assert translation_error(estimate.T_map_camera, photo.T_map_camera) < 0.03
 
 
-def assert_no_answer(estimate) -> None:
-    assert estimate.status in (Status.FAILED, Status.REJECTED)
-    assert not estimate.localized
-    assert estimate.T_map_camera is None
-    assert estimate.covariance is None
-    assert estimate.reason
+def test_the_trace_has_the_pictures_that_the_estimate_was_made_from(sift_localizer, room_camera, room_photos) -> None:
+    photo = room_photos[0]
+    trace = sift_localizer.trace(photo.image, room_camera, photo.T_map_camera_prior)
+    assert trace.photo.image.shape == trace.render.rgb.shape == (480, 640, 3)
+    assert len(trace.correspondences) == trace.estimate.evidence.inliers
+    # The render is within half a pixel of the answer: it shows what the photo does at nearly the same pixels.
+    assert np.median(np.linalg.norm(trace.correspondences.a - trace.correspondences.b, axis=1)) < 1.0
+    nothing = sift_localizer.trace(np.zeros_like(photo.image), room_camera, photo.T_map_camera_prior)
+    assert nothing.render is None
+    assert len(nothing.correspondences) == 0
+
+
+def test_stages_are_measured_on_the_clock_that_is_given(renderer, room_camera, room_photos) -> None:
+    ticks = itertools.count()
+    localizer = Localizer(renderer, create_matcher("sift"), now=lambda: float(next(ticks)))
+    photo = room_photos[0]
+    milliseconds = localizer.localize(photo.image, room_camera, photo.T_map_camera_prior).milliseconds
+    assert all(ms % 1000 == 0 for ms in milliseconds.values())
+    assert milliseconds["prepare"] == 1000
 
 
 @pytest.mark.parametrize("value", [0, 128, 255], ids=["black", "grey", "white"])
@@ -120,22 +139,24 @@ def test_an_answer_far_from_the_prior_is_rejected(sift_localizer, room_camera, r
     assert "standard deviations from the prior" in estimate.reason
 
 
-def test_the_render_at_the_estimate_is_the_judge(renderer, room_camera, room_photos) -> None:
+def test_the_estimate_is_verified_by_the_render_there(renderer, room_camera, room_photos) -> None:
     """What it is asked for and does not have is said; the pose is kept back."""
     photo = room_photos[0]
     demands = {
         "min_inliers": (100_000, "at least 100000 needed"),
         "min_inlier_ratio": (1.0, "inliers"),
         "min_coverage": (1.1, "of the photo"),
-        "min_agreement": (1.1, "correlation"),
+        "min_correlation": (1.1, "correlation"),
     }
     for option, (value, says) in demands.items():
-        demanding = Localizer(renderer, create_matcher("sift"), LocalizerOptions(max_views=0, **{option: value}))
+        demanding = Localizer(
+            renderer, create_matcher("sift"), LocalizerOptions(max_views=0, limits=Limits(**{option: value}))
+        )
         estimate = demanding.localize(photo.image, room_camera, photo.T_map_camera_prior)
         assert estimate.status is Status.REJECTED
         assert_no_answer(estimate)
         assert says in estimate.reason
-        assert estimate.passes >= 1
+        assert estimate.evidence.passes >= 1
 
 
 def test_distortion_is_taken_out(sift_localizer, room_camera, room_photos) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -17,9 +19,16 @@ from gsfeatloc_ros.common.geometry import (
     transform,
     translation_error,
 )
-from gsfeatloc_ros.pose import solve
-from gsfeatloc_ros.pose.lift import DEPTH_SIGMA_PER_STD, MAX_DEPTH_STD, lift
-from gsfeatloc_ros.pose.solve import MIN_POINTS, _linearize, refine_pose, reprojection_errors, solve_pose
+from gsfeatloc_ros.pose.lift import DEPTH_SIGMA_PER_STD, MAX_DEPTH_STD, LiftOptions, lift
+from gsfeatloc_ros.pose.solve import (
+    MIN_POINTS,
+    Correspondences,
+    PoseOptions,
+    _linearize,
+    refine_pose,
+    reprojection_errors,
+    solve_pose,
+)
 from gsfeatloc_ros.render.base import Render
 
 CAMERA = Camera(640, 480, np.array([[600.0, 0, 315], [0, 610.0, 245], [0, 0, 1]]))
@@ -41,7 +50,7 @@ def small_camera(width: int = 40, height: int = 30) -> Camera:
 @given(st.floats(0, 39), st.floats(0, 29))
 def test_lifts_at_subpixel_positions(x: float, y: float) -> None:
     pixels = np.array([[x, y]])
-    lifted = lift(plane_render(), small_camera(), POSE, pixels)
+    lifted = lift(plane_render(), small_camera(), POSE, pixels, LiftOptions())
     assert lifted.valid.all()
     in_camera = transform(invert(POSE), lifted.points)
     np.testing.assert_allclose(in_camera[0, 2], 2 + 0.01 * x + 0.02 * y, rtol=1e-6)
@@ -50,7 +59,7 @@ def test_lifts_at_subpixel_positions(x: float, y: float) -> None:
 
 def test_uncertainty_lies_along_the_ray() -> None:
     pixels = np.array([[3.0, 4.0], [30.5, 20.25]])
-    lifted = lift(plane_render(), small_camera(), POSE, pixels)
+    lifted = lift(plane_render(), small_camera(), POSE, pixels, LiftOptions())
     rays = lifted.points - POSE[:3, 3]
     cosine = (rays * lifted.sigmas).sum(1) / np.linalg.norm(rays, axis=1) / np.linalg.norm(lifted.sigmas, axis=1)
     np.testing.assert_allclose(cosine, 1.0)
@@ -61,13 +70,13 @@ def test_uncertainty_lies_along_the_ray() -> None:
 def test_a_floater_does_not_void_the_uncertainty() -> None:
     render = plane_render()
     render.depth_std[:] = 50.0
-    lifted = lift(render, small_camera(), np.eye(4), np.array([[10.0, 10.0]]))
+    lifted = lift(render, small_camera(), np.eye(4), np.array([[10.0, 10.0]]), LiftOptions())
     assert lifted.sigmas[0, 2] == pytest.approx(DEPTH_SIGMA_PER_STD * MAX_DEPTH_STD * 2.3)
 
 
 @pytest.mark.parametrize("pixel", [(-0.1, 5), (39.1, 5), (5, -0.1), (5, 29.1), (np.nan, 5)])
 def test_pixels_outside_are_not_lifted(pixel) -> None:
-    lifted = lift(plane_render(), small_camera(), POSE, np.array([pixel]))
+    lifted = lift(plane_render(), small_camera(), POSE, np.array([pixel]), LiftOptions())
     assert not lifted.valid.any()
     assert np.isnan(lifted.points).all()
 
@@ -78,35 +87,40 @@ def test_refuses_edges_thin_alpha_and_missing_depth() -> None:
     render.alpha[5, 5] = 0.6
     render.median_depth[10, 10] = np.nan
     pixels = np.array([[19.5, 3.0], [18.5, 3.0], [5.4, 5.4], [9.7, 9.6], [15.0, 25.0]])
-    assert lift(render, small_camera(), POSE, pixels).valid.tolist() == [False, True, False, False, True]
+    assert lift(render, small_camera(), POSE, pixels, LiftOptions()).valid.tolist() == [False, True, False, False, True]
 
 
 def test_nothing_to_lift() -> None:
-    lifted = lift(plane_render(), small_camera(), POSE, np.empty((0, 2)))
+    lifted = lift(plane_render(), small_camera(), POSE, np.empty((0, 2)), LiftOptions())
     assert lifted.points.shape == (0, 3)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 9), (9, 1)])
 def test_lifts_from_images_one_pixel_wide_or_high(size) -> None:
-    lifted = lift(plane_render(*size), small_camera(*size), POSE, np.zeros((1, 2)))
+    lifted = lift(plane_render(*size), small_camera(*size), POSE, np.zeros((1, 2)), LiftOptions())
     assert lifted.valid.all()
 
 
-def scene(seed: int, count: int = 200, noise: float = 0.5, outliers: float = 0.0):
-    """Pixels (N, 2), points (N, 3) and which are outliers, seen from POSE."""
+def scene(seed: int, count: int = 200, noise: float = 0.5, outliers: float = 0.0) -> tuple[Correspondences, np.ndarray]:
+    """Matches seen from POSE, and which of them are outliers (N,)."""
     rng = np.random.default_rng(seed)
     in_camera = CAMERA.rays(rng.uniform([0, 0], [639, 479], (count, 2))) * rng.uniform(2, 8, (count, 1))
     pixels = CAMERA.project(in_camera) + noise * rng.normal(size=(count, 2))
     wrong = rng.random(count) < outliers
     pixels[wrong] = rng.uniform([0, 0], [639, 479], (int(wrong.sum()), 2))
-    return pixels, transform(POSE, in_camera), wrong
+    return exact(pixels, transform(POSE, in_camera)), wrong
+
+
+def exact(pixels: np.ndarray, points: np.ndarray) -> Correspondences:
+    """Matches whose points have no uncertainty."""
+    return Correspondences(pixels, points, np.zeros_like(points))
 
 
 @settings(max_examples=30, deadline=None)
 @given(seed=st.integers(0, 2**31), outliers=st.floats(0, 0.6))
 def test_finds_the_pose_among_outliers(seed: int, outliers: float) -> None:
-    pixels, points, wrong = scene(seed, noise=0.5, outliers=outliers)
-    solution = solve_pose(CAMERA, pixels, points, np.zeros_like(points), 3.0, seed=0)
+    found, wrong = scene(seed, noise=0.5, outliers=outliers)
+    solution = solve_pose(CAMERA, found, PoseOptions(), seed=0)
     assert rotation_error_deg(solution.T_map_camera, POSE) < 0.2
     assert translation_error(solution.T_map_camera, POSE) < 0.03
     assert (solution.inliers[~wrong]).mean() > 0.95
@@ -114,68 +128,66 @@ def test_finds_the_pose_among_outliers(seed: int, outliers: float) -> None:
 
 
 def test_the_same_seed_gives_the_same_answer() -> None:
-    pixels, points, _ = scene(4, outliers=0.5)
-    a, b = (solve_pose(CAMERA, pixels, points, np.zeros_like(points), 3.0, seed=7) for _ in range(2))
+    found, _ = scene(4, outliers=0.5)
+    a, b = (solve_pose(CAMERA, found, PoseOptions(), seed=7) for _ in range(2))
     np.testing.assert_array_equal(a.T_map_camera, b.T_map_camera)
     np.testing.assert_array_equal(a.covariance, b.covariance)
 
 
 @pytest.mark.parametrize("count", range(MIN_POINTS))
 def test_too_few_points_are_no_answer(count: int) -> None:
-    pixels, points, _ = scene(0, count=count)
-    assert solve_pose(CAMERA, pixels, points, np.zeros_like(points), 3.0, seed=0) is None
+    found, _ = scene(0, count=count)
+    assert solve_pose(CAMERA, found, PoseOptions(), seed=0) is None
 
 
 def test_points_that_determine_no_pose_are_no_answer() -> None:
     """All matches at one point: any rotation about the ray will do."""
-    pixels, points = np.full((50, 2), 100.0), np.full((50, 3), 2.0)
-    assert solve_pose(CAMERA, pixels, points, np.zeros_like(points), 3.0, seed=0) is None
+    found = exact(np.full((50, 2), 100.0), np.full((50, 3), 2.0))
+    assert solve_pose(CAMERA, found, PoseOptions(), seed=0) is None
 
 
 def test_noise_alone_finds_few_inliers() -> None:
     rng = np.random.default_rng(0)
-    pixels, points = rng.uniform([0, 0], [639, 479], (100, 2)), rng.uniform(-3, 3, (100, 3))
-    solution = solve_pose(CAMERA, pixels, points, np.zeros_like(points), 3.0, seed=0)
+    found = exact(rng.uniform([0, 0], [639, 479], (100, 2)), rng.uniform(-3, 3, (100, 3)))
+    solution = solve_pose(CAMERA, found, PoseOptions(), seed=0)
     assert solution is None or solution.inliers.sum() < 10
 
 
 def test_jacobians_equal_finite_differences() -> None:
-    pixels, points, _ = scene(1, count=20)
+    found, _ = scene(1, count=20)
     camera = Camera(640, 480, np.array([[600.0, 3.0, 315], [0, 610.0, 245], [0, 0, 1]]))
-    _, jacobian, by_point = _linearize(camera, POSE, pixels, points)
+
+    def residuals(by_pose: np.ndarray, by_point: np.ndarray) -> np.ndarray:
+        pose = make_pose(so3_exp(by_pose[3:]) @ POSE[:3, :3], POSE[:3, 3] + by_pose[:3])
+        return _linearize(camera, pose, replace(found, points=found.points + by_point)).residuals
+
+    linear = _linearize(camera, POSE, found)
     step = 1e-6
-    for k in range(6):
-        delta = np.zeros(6)
-        delta[k] = step
-        plus, minus = (
-            _linearize(
-                camera, make_pose(so3_exp(s * delta[3:]) @ POSE[:3, :3], POSE[:3, 3] + s * delta[:3]), pixels, points
-            )[0]
-            for s in (1, -1)
-        )
-        np.testing.assert_allclose(jacobian[:, :, k], (plus - minus) / (2 * step), rtol=1e-5, atol=1e-4)
-    for k in range(3):
-        delta = step * np.eye(3)[k]
-        plus, minus = (_linearize(camera, POSE, pixels, points + s * delta)[0] for s in (1, -1))
-        np.testing.assert_allclose(by_point[:, :, k], (plus - minus) / (2 * step), rtol=1e-5, atol=1e-4)
+    for k, delta in enumerate(step * np.eye(6)):
+        slope = (residuals(delta, np.zeros(3)) - residuals(-delta, np.zeros(3))) / (2 * step)
+        np.testing.assert_allclose(linear.by_pose[:, :, k], slope, rtol=1e-5, atol=1e-4)
+    for k, delta in enumerate(step * np.eye(3)):
+        slope = (residuals(np.zeros(6), delta) - residuals(np.zeros(6), -delta)) / (2 * step)
+        np.testing.assert_allclose(linear.by_point[:, :, k], slope, rtol=1e-5, atol=1e-4)
 
 
 @pytest.mark.parametrize("depth_noise", [0.0, 0.2], ids=["keypoint noise", "keypoint and depth noise"])
-def test_covariance_of_independent_errors_is_that_of_many_trials(monkeypatch, depth_noise: float) -> None:
+def test_covariance_of_independent_errors_is_that_of_many_trials(depth_noise: float) -> None:
     """Normalised estimation error squared per degree of freedom is 1 when the covariance is true.
 
     For Gaussian noise, the narrow loss that real residuals call for errs to safety.
     """
-    monkeypatch.setattr(solve, "_SHARED_PIXEL_SIGMA", 0.0)
     nees = []
     for seed in range(150):
-        pixels, points, _ = scene(seed, noise=0.7)
+        found, _ = scene(seed, noise=0.7)
+        points = found.points
         rng = np.random.default_rng(seed)
         # Each point was lifted on a ray of another camera, one unit to the side.
         rays = points - (POSE[:3, 3] + [1.0, 0.5, 0])
         sigmas = depth_noise * rays / np.linalg.norm(rays, axis=1, keepdims=True)
         moved = points + sigmas * rng.normal(size=(len(points), 1))
-        pose, covariance = refine_pose(CAMERA, POSE, pixels, moved, sigmas)
+        lifted = Correspondences(found.pixels, moved, sigmas)
+        pose, covariance = refine_pose(CAMERA, POSE, lifted, PoseOptions(shared_error=0.0))
         error = np.concatenate([pose[:3, 3] - POSE[:3, 3], so3_log(pose[:3, :3] @ POSE[:3, :3].T)])
         nees.append(error @ np.linalg.solve(covariance, error) / 6)
     assert 0.5 < np.mean(nees) < 1.2
@@ -184,18 +196,18 @@ def test_covariance_of_independent_errors_is_that_of_many_trials(monkeypatch, de
 def test_errors_that_matches_share_do_not_average_out() -> None:
     """A hundred times the matches leave the covariance nearly as large."""
     few, many = (
-        refine_pose(CAMERA, POSE, pixels, points, np.zeros_like(points))[1]
-        for pixels, points, _ in (scene(0, count=1000, noise=0.3), scene(0, count=100_000, noise=0.3))
+        refine_pose(CAMERA, POSE, found, PoseOptions())[1]
+        for found, _ in (scene(0, count=1000, noise=0.3), scene(0, count=100_000, noise=0.3))
     )
     assert np.trace(many[:3, :3]) > 0.5 * np.trace(few[:3, :3])
 
 
 def test_reprojection_error_behind_the_camera_is_infinite() -> None:
     behind = transform(POSE, np.array([[0.1, 0.2, -3.0]]))
-    assert np.isinf(reprojection_errors(CAMERA, POSE, np.zeros((1, 2)), behind)).all()
+    assert np.isinf(reprojection_errors(CAMERA, POSE, exact(np.zeros((1, 2)), behind))).all()
 
 
 def test_refinement_refuses_points_behind_the_camera() -> None:
-    pixels, points, _ = scene(0)
-    points[0] = transform(POSE, np.array([[0, 0, -1.0]]))[0]
-    assert refine_pose(CAMERA, POSE, pixels, points, np.zeros_like(points)) == (None, None)
+    found, _ = scene(0)
+    found.points[0] = transform(POSE, np.array([[0, 0, -1.0]]))[0]
+    assert refine_pose(CAMERA, POSE, found, PoseOptions()) is None

@@ -11,10 +11,11 @@ from gsfeatloc_ros.common.geometry import make_pose, rotation_error_deg, so3_exp
 from gsfeatloc_ros.common.photo import Photo
 from gsfeatloc_ros.common.stage_clock import StageClock
 from gsfeatloc_ros.localize.estimate import Status
-from gsfeatloc_ros.localize.localizer import Localizer, LocalizerOptions
-from gsfeatloc_ros.localize.query import MatchedView
+from gsfeatloc_ros.localize.localizer import Localizer
+from gsfeatloc_ros.localize.options import LocalizerOptions
+from gsfeatloc_ros.localize.query import Components, MatchedView, Query
 from gsfeatloc_ros.localize.search import SEARCH_WIDTH, look, promising, spread_poses
-from gsfeatloc_ros.match import create_matcher
+from gsfeatloc_ros.match import create_matcher, create_tracker
 from gsfeatloc_ros.render import create_renderer
 
 # However near to each other views are.
@@ -92,9 +93,8 @@ def renderer(room_map):
 
 def seen(renderer, camera, image: np.ndarray, views: list[np.ndarray]) -> list[MatchedView]:
     """The views of the map from some poses, beside a photo."""
-    matcher = create_matcher("sift")
-    small = Photo.undistorted(image, camera, SEARCH_WIDTH)
-    return look(renderer, matcher, matcher.features(small.image), small.camera, views, 3.0, 0, StageClock())
+    components = Components(renderer, create_matcher("sift"), create_tracker, LocalizerOptions())
+    return look(Query(components, Photo.undistorted(image, camera, SEARCH_WIDTH), StageClock()), views)
 
 
 def turned(pose: np.ndarray, degrees: float) -> np.ndarray:
@@ -127,11 +127,11 @@ def test_finds_a_camera_that_was_turned_away(renderer, room_camera, room_photos)
     prior = turned(photo.T_map_camera, 100)
     covariance = np.diag([0.01] * 3 + [1.0] * 3)
     matcher = create_matcher("sift")
-    without = Localizer(renderer, matcher, LocalizerOptions(max_views=0))
-    assert without.localize(photo.image, room_camera, prior).status is not Status.LOCALIZED
+    narrow = Localizer(renderer, matcher, LocalizerOptions(max_views=0))
+    assert narrow.localize(photo.image, room_camera, prior).status is not Status.LOCALIZED
     estimate = Localizer(renderer, matcher).localize(photo.image, room_camera, prior, covariance)
     assert estimate.localized, estimate.reason
-    assert 0 < estimate.views <= 32
+    assert 0 < estimate.evidence.views <= 32
     assert rotation_error_deg(estimate.T_map_camera, photo.T_map_camera) < 1.0
     assert translation_error(estimate.T_map_camera, photo.T_map_camera) < 0.02
 
@@ -140,7 +140,7 @@ def test_easy_photos_search_nothing(renderer, room_camera, room_photos) -> None:
     photo = room_photos[0]
     estimate = Localizer(renderer, create_matcher("sift")).localize(photo.image, room_camera, photo.T_map_camera_prior)
     assert estimate.localized
-    assert estimate.views == 0
+    assert estimate.evidence.views == 0
 
 
 def test_the_search_ends_with_a_reason(renderer, room_camera) -> None:
@@ -148,7 +148,7 @@ def test_the_search_ends_with_a_reason(renderer, room_camera) -> None:
     localizer = Localizer(renderer, create_matcher("sift"), LocalizerOptions(max_views=9))
     estimate = localizer.localize(noise, room_camera, np.eye(4))
     assert not estimate.localized
-    assert estimate.views == 9
+    assert estimate.evidence.views == 9
     assert "nothing in common" in estimate.reason
 
 
