@@ -19,13 +19,13 @@ from rclpy.lifecycle import LifecycleNode
 from gsfeatloc_ros.node.parameters import PARAMETERS
 
 ROOT = Path(__file__).parents[2]
-README = (ROOT / "README.md").read_text(encoding="utf-8")
+TOPICS = (ROOT / "docs/topics-and-services.md").read_text(encoding="utf-8")
 DEPLOYMENT = (ROOT / "docs/deployment.md").read_text(encoding="utf-8")
 
 
 def table(header: str) -> dict[str, str]:
-    """Names with their types in the README's table whose first column is called `header`."""
-    rows = README.split(f"| {header} | type |")[1].split("\n\n")[0]
+    """Return names with their types in the table of docs/ whose first column is called `header`."""
+    rows = TOPICS.split(f"| {header} | type |")[1].split("\n\n")[0]
     return {name.lstrip("/"): kind for name, kind in re.findall(r"^\| `([^`]+)` \| (\S+) \|", rows, re.MULTILINE)}
 
 
@@ -150,7 +150,7 @@ def test_the_policy_allows_what_the_node_has_and_no_more(policy: dict[tuple[str,
     assert {"/rosout", "/localizer/transition_event"} <= own_topics
     assert "/localizer/change_state" in own_services
     assert policy == {
-        # Of tf, the clock and the odometry the README has no rows in its tables.
+        # Of tf, the clock and the odometry that tf carries there are no rows in the tables.
         ("topics", "subscribe"): {absolute(name) for name in SUBSCRIBED} | {"/odom", "/tf", "/tf_static", "/clock"},
         ("topics", "publish"): {absolute(name) for name in PUBLISHED} | {"/tf"} | own_topics,
         ("services", "reply"): {absolute(name) for name in SERVICES} | own_services,
