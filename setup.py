@@ -16,9 +16,9 @@ superpoint = ["transformers>=5.0,<6"]
 setup(
     name=package_name,
     version="0.1.0",
-    description="Relocalization of a camera in a 3D Gaussian Splatting map, for ROS 2 Jazzy",
-    maintainer="gsfeatloc_ros maintainers",
-    maintainer_email="maintainers@example.com",
+    description="Localize a camera in a 3D Gaussian Splatting map, for ROS 2 Jazzy",
+    maintainer="gsfeatloc_ros developers",
+    maintainer_email="gsfeatloc_ros@users.noreply.github.com",
     license="Apache-2.0",
     packages=find_packages(exclude=["test"]),
     package_data={f"{package_name}.evaluate.report": ["page.html.j2"]},
