@@ -1,4 +1,4 @@
-"""A picture of one localization: the photo beside the render, what was matched, and in words how it ended."""
+"""A picture of one localization: the photo beside the render, what was matched, and how it ended in words."""
 
 from __future__ import annotations
 
@@ -7,24 +7,26 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from gsfeatloc_ros.localize.estimate import Estimate, Status
+from gsfeatloc_ros.localize.estimate import Estimate, Status, Trace
 from gsfeatloc_ros.match.base import Matches
+from gsfeatloc_ros.ros_io.outcome import OutcomeStatus
 
 # Pixels. Pictures are of one width, whatever the photo's, so that the words are as large in all of them.
 _WIDTH = 1280
-_MAX_HEIGHT = 960  # of the photo in it
-_RADIUS = 3
+_MAX_PHOTO_HEIGHT = 960
+_RING_RADIUS = 3
 # Lines join one match in each of these cells of the photo, across and down: more would hide what they cross.
-_CELLS = np.array([8, 6])
+_LINE_CELLS = np.array([8, 6])
 _LINE_OPACITY = 0.5
-# Drawn at 1/16 of a pixel, as cv2 counts with `shift=4`.
-_SHIFT = 4
+# Fraction bits of the coordinates of what is drawn, as cv2 counts them: 1/16 of a pixel.
+_FRACTION_BITS = 4
 
 # RGB.
 _BACKGROUND, _LABEL, _TEXT = (24, 26, 30), (150, 158, 168), (238, 240, 243)
 _GREEN, _AMBER, _RED = (36, 145, 60), (190, 120, 0), (200, 48, 42)
 _COLOURS = {Status.LOCALIZED: _GREEN, Status.REJECTED: _AMBER, Status.FAILED: _RED}
 
+# Sizes as cv2 counts them, then pixels.
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 _TEXT_SIZE, _LABEL_SIZE = 0.5, 0.42
 _MARGIN = 12
@@ -35,48 +37,48 @@ _ROW_HEIGHT = 42
 _COLUMN_WIDTH = 104
 _COLUMN_GAP = 12
 # Room kept for the reason: nearly all pictures are of one height, as recorders of video want them.
-_REASON_LINES = 2
+_MIN_REASON_LINES = 2
 
 # A name and what stands below it.
 Field = tuple[str, str]
 
 
-def draw(photo: np.ndarray, estimate: Estimate) -> np.ndarray:
-    """What the localizer made of a photo.
+def draw(trace: Trace) -> np.ndarray:
+    """Draw what the localizer made of a photo.
 
-    The photo beside the last render that was matched with it. Inliers have a ring at both ends, in a colour that goes
-    with their place in the photo, and some of them a line. Below are the status, the reason, the evidence, the pose's
-    standard deviations (along and about the axes of the map frame; map units, degrees) and milliseconds by stage.
-
-    Args:
-        photo: (H, W, 3) uint8 RGB as it was localized, undistorted and resized (Photo.undistorted).
-        estimate: of that photo.
+    The photo stands beside the last render that it was compared with. Inliers have a ring at both ends, in a colour
+    that goes with their place in the photo, and some of them a line. Below are the status, the reason, the evidence,
+    milliseconds by stage and the pose's standard deviations (along and about the axes of the map frame; map units,
+    degrees).
 
     Returns:
-        (H', 1280, 3) uint8 RGB.
+        (H, 1280, 3) uint8 RGB.
     """
+    photo, estimate = trace.photo.image, trace.estimate
     left = _resized(photo, _size(photo))
-    right = _nothing(left, "no render was matched")
-    if estimate.last_render is not None:
-        right = _resized(estimate.last_render.image(), _size(photo))
+    right = _black(left, "no render was matched")
+    if trace.render is not None:
+        right = _resized(trace.render.image(), _size(photo))
     pair = np.hstack([left, right])
-    if estimate.correspondences:
+    if trace.correspondences:
         # The render is of the photo's size where there are inliers.
-        _draw_matches(pair, estimate.correspondences, left.shape[1] / photo.shape[1])
-    rows = [_evidence(estimate), [(name, f"{ms:.0f} ms") for name, ms in estimate.milliseconds.items()]]
+        _draw_matches(pair, trace.correspondences, left.shape[1] / photo.shape[1])
+    times = [(name, f"{ms:.0f} ms") for name, ms in estimate.milliseconds.items()]
+    rows = [_evidence(estimate), times + _deviations(estimate)]
     return _with_words(pair, estimate.status.value, _COLOURS[estimate.status], estimate.reason, rows)
 
 
 def draw_refused(photo: np.ndarray, reason: str) -> np.ndarray:
-    """The same of a photo (H, W, 3) uint8 RGB of any size that was not tried, and why."""
+    """Draw a photo (H, W, 3) uint8 RGB of any size that was not tried, and why; of the same layout as `draw`."""
     left = _resized(photo, _size(photo))
-    return _with_words(np.hstack([left, _nothing(left, "not tried")]), "refused", _RED, reason, [[], []])
+    pair = np.hstack([left, _black(left, "not tried")])
+    return _with_words(pair, OutcomeStatus.REFUSED.value, _RED, reason, [[], []])
 
 
 def _size(photo: np.ndarray) -> tuple[int, int]:
-    """Width and height of the photo in the picture."""
+    """Return the width and height of the photo in the picture."""
     height, width = photo.shape[:2]
-    scale = min(_WIDTH / 2 / width, _MAX_HEIGHT / height)
+    scale = min(_WIDTH / 2 / width, _MAX_PHOTO_HEIGHT / height)
     return max(1, round(width * scale)), max(1, round(height * scale))
 
 
@@ -86,8 +88,8 @@ def _resized(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     return cv2.resize(image, size, interpolation=cv2.INTER_AREA if image.shape[1] > size[0] else cv2.INTER_LINEAR)
 
 
-def _nothing(photo: np.ndarray, words: str) -> np.ndarray:
-    """Black of the photo's size, with words in the middle."""
+def _black(photo: np.ndarray, words: str) -> np.ndarray:
+    """Return a black picture of the photo's size with words in the middle."""
     picture = np.zeros_like(photo)
     height, width = photo.shape[:2]
     _write(picture, words, ((width - _text_width(words)) // 2, height // 2), _TEXT_SIZE, _LABEL)
@@ -101,45 +103,42 @@ def _draw_matches(pair: np.ndarray, matches: Matches, scale: float) -> None:
     b = b + np.array([width, 0])
     hues = (170 * a[:, 0] / width).clip(0, 170)
     colours = _rgb(hues).tolist()
-    a, b = (np.rint(pixels * (1 << _SHIFT)).astype(int) for pixels in (a, b))
+    a, b = (np.rint(pixels * (1 << _FRACTION_BITS)).astype(int) for pixels in (a, b))
     lines = pair.copy()
     for index in _one_a_cell(matches.a * scale / [width, height]):
-        cv2.line(lines, a[index].tolist(), b[index].tolist(), colours[index], 1, cv2.LINE_AA, _SHIFT)
+        cv2.line(lines, a[index].tolist(), b[index].tolist(), colours[index], 1, cv2.LINE_AA, _FRACTION_BITS)
     cv2.addWeighted(lines, _LINE_OPACITY, pair, 1 - _LINE_OPACITY, 0, dst=pair)
     for pixels in (a, b):
         for centre, colour in zip(pixels.tolist(), colours, strict=True):
-            cv2.circle(pair, centre, _RADIUS << _SHIFT, colour, 1, cv2.LINE_AA, _SHIFT)
+            cv2.circle(pair, centre, _RING_RADIUS << _FRACTION_BITS, colour, 1, cv2.LINE_AA, _FRACTION_BITS)
 
 
 def _rgb(hues: np.ndarray) -> np.ndarray:
-    """Bright colours (N, 3) uint8 of hues (N,) in cv2's half degrees."""
+    """Return bright colours (N, 3) uint8 of hues (N,) in cv2's half degrees."""
     hsv = np.column_stack([hues, np.full(len(hues), 200.0), np.full(len(hues), 255.0)]).astype(np.uint8)
     return cv2.cvtColor(hsv[None], cv2.COLOR_HSV2RGB)[0]
 
 
 def _one_a_cell(places: np.ndarray) -> np.ndarray:
-    """Indices of the first in each of _CELLS of the places (N, 2), in shares of the photo."""
-    columns, rows = np.clip(places * _CELLS, 0, _CELLS - 1).astype(int).T
-    return np.unique(rows * _CELLS[0] + columns, return_index=True)[1]
+    """Return the index of the first in each of _LINE_CELLS of the places (N, 2), in shares of the photo."""
+    columns, rows = np.clip(places * _LINE_CELLS, 0, _LINE_CELLS - 1).astype(int).T
+    return np.unique(rows * _LINE_CELLS[0] + columns, return_index=True)[1]
 
 
 def _evidence(estimate: Estimate) -> list[Field]:
-    fields = [
-        ("matches", f"{estimate.matches}"),
-        ("inliers", f"{estimate.inliers}"),
-        ("inlier ratio", f"{estimate.inlier_ratio:.2f}"),
-        ("coverage", f"{estimate.coverage:.0%}"),
-        ("agreement", f"{estimate.agreement:.2f}"),
-        ("reprojection", f"{estimate.reprojection_error:.2f} px"),
-        ("views", f"{estimate.views}"),
-        ("passes", f"{estimate.passes}"),
+    return [
+        (name.replace("_", " "), "-" if text == "nan" else text) for name, text in estimate.evidence.texts().items()
     ]
-    fields = [(name, "-" if "nan" in value else value) for name, value in fields]
-    if estimate.covariance is not None:
-        deviations = np.sqrt(np.diag(estimate.covariance))
-        fields.append(("std dev along x, y, z", _numbers(deviations[:3])))
-        fields.append(("about x, y, z, degrees", _numbers(np.degrees(deviations[3:]))))
-    return fields
+
+
+def _deviations(estimate: Estimate) -> list[Field]:
+    if estimate.covariance is None:
+        return []
+    deviations = np.sqrt(np.diag(estimate.covariance))
+    return [
+        ("std dev along x, y, z", _numbers(deviations[:3])),
+        ("about x, y, z, degrees", _numbers(np.degrees(deviations[3:]))),
+    ]
 
 
 def _numbers(values: np.ndarray) -> str:
@@ -149,9 +148,9 @@ def _numbers(values: np.ndarray) -> str:
 def _with_words(
     pair: np.ndarray, status: str, colour: tuple[int, int, int], reason: str, rows: Sequence[Sequence[Field]]
 ) -> np.ndarray:
-    """The pictures with the status, the reason and rows of fields below."""
+    """Put the status, the reason and rows of fields below the pictures."""
     reason_lines = _wrapped(reason, _WIDTH - _STATUS_WIDTH - 3 * _MARGIN)
-    reason_height = max(_REASON_LINES, len(reason_lines)) * _LINE_HEIGHT
+    reason_height = max(_MIN_REASON_LINES, len(reason_lines)) * _LINE_HEIGHT
     height = 2 * _MARGIN + reason_height + len(rows) * _ROW_HEIGHT
     band = np.full((height, _WIDTH, 3), _BACKGROUND, np.uint8)
 
@@ -175,7 +174,7 @@ def _with_words(
 
 
 def _wrapped(text: str, width: int) -> list[str]:
-    """Lines of whole words, at most `width` pixels wide; only a word that is wider by itself is cut."""
+    """Break a text into lines of whole words, at most `width` pixels wide; only a wider word is cut itself."""
     lines = [""]
     for word in text.split():
         if lines[-1] and _text_width(f"{lines[-1]} {word}") > width:

@@ -1,28 +1,32 @@
-"""What comes in ROS messages as the localizer's own types, checked at the door.
+"""Decode ROS messages into the localizer's own types.
 
 Everything that comes from outside is checked here and nowhere else: a message that cannot be used raises ValueError,
 which says what is wrong and what to do about it.
-
-A message may be one of rclpy or one that rosbags read from a bag: all that counts are the fields of its type.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
 
 from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.geometry import make_pose, matrix_from_quaternion
+from gsfeatloc_ros.ros_io.message_types import (
+    AnyImage,
+    AnyPose,
+    CameraInfo,
+    CompressedImage,
+    Image,
+    Odometry,
+    Pose,
+    Time,
+)
 
-# Messages by the names of their types; not imported, for ROS may not be installed.
-Image = CompressedImage = CameraInfo = PoseStamped = PoseWithCovarianceStamped = Odometry = Time = Any
-
-# No camera is larger; a message that says so is corrupt.
+# Pixels. No camera is larger; a message that says so is corrupt.
 MAX_SIDE = 16384
-# Of a prior; a larger one says nothing, and products of it overflow.
+# Of a prior, in m^2 or rad^2; a larger one says nothing, and products of it overflow.
 _MAX_VARIANCE = 1e12
 
 
@@ -90,7 +94,7 @@ ENCODINGS = {
 
 
 def validate_image(message: Image) -> None:
-    """Check, without touching the pixels, that an image can be decoded.
+    """Check that an image can be decoded, without touching the pixels.
 
     Raises:
         ValueError: unknown encoding, a size that no camera has, or data and step that do not hold the pixels.
@@ -124,7 +128,7 @@ def validate_image(message: Image) -> None:
 
 
 def decode_image(message: Image) -> np.ndarray:
-    """Pixels (H, W, 3) uint8 RGB of an image of any of the ENCODINGS; an alpha channel is dropped.
+    """Return the pixels (H, W, 3) uint8 RGB of an image of any of the ENCODINGS; an alpha channel is dropped.
 
     16-bit samples are taken over their full range, as in cv_bridge: 65535 becomes 255.
 
@@ -151,7 +155,7 @@ def decode_image(message: Image) -> np.ndarray:
 
 
 def decode_compressed_image(message: CompressedImage) -> np.ndarray:
-    """Pixels (H, W, 3) uint8 RGB of a JPEG or PNG image, grey or in colour; an alpha channel is dropped.
+    """Return the pixels (H, W, 3) uint8 RGB of a JPEG or PNG image, grey or in colour; an alpha channel is dropped.
 
     Raises:
         ValueError: no JPEG or PNG of a picture, a damaged one, or the raw pattern of a Bayer filter.
@@ -173,13 +177,13 @@ def decode_compressed_image(message: CompressedImage) -> np.ndarray:
     return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
 
 
-def picture_size(message: Image | CompressedImage) -> tuple[int, int]:
-    """Width and height of the picture in an image message of either type, without decoding it.
+def picture_size(message: AnyImage) -> tuple[int, int]:
+    """Return the width and height of the picture in an image message of either type, without decoding it.
 
     Raises:
         ValueError: no JPEG or PNG, or a size that no camera has: a few bytes can declare gigabytes.
     """
-    if not hasattr(message, "format"):
+    if not isinstance(message, CompressedImage):
         return message.width, message.height
     data = bytes(message.data)
     width, height = _png_size(data) or _jpeg_size(data) or (0, 0)
@@ -197,7 +201,7 @@ def _png_size(data: bytes) -> tuple[int, int] | None:
 
 
 def _jpeg_size(data: bytes) -> tuple[int, int] | None:
-    """Of the first frame header: a marker from C0 to CF, but for three that are of tables (ITU-T T.81, table B.1)."""
+    """Look for the first frame header: a marker from C0 to CF, but for three of tables (ITU-T T.81, table B.1)."""
     place = 2
     while data.startswith(b"\xff\xd8") and place + 9 <= len(data):
         marker = data[place + 1]
@@ -213,7 +217,7 @@ def _jpeg_size(data: bytes) -> tuple[int, int] | None:
 
 
 def decode_camera(message: CameraInfo, rectified: bool = False) -> Camera:
-    """Camera of the images that come with a CameraInfo, its region of interest and binning taken in.
+    """Return the camera of the images that come with a CameraInfo, its region of interest and binning taken in.
 
     Args:
         message: the camera's calibration.
@@ -238,7 +242,8 @@ def decode_camera(message: CameraInfo, rectified: bool = False) -> Camera:
         )
     try:
         # Drivers leave the name of the model empty when there is no distortion.
-        distortion, model = ([], "plumb_bob") if rectified else (message.d, message.distortion_model or "plumb_bob")
+        model = "plumb_bob" if rectified else message.distortion_model or "plumb_bob"
+        distortion = np.zeros(0) if rectified else np.asarray(message.d)
         offset = np.array([[0, 0, roi.x_offset], [0, 0, roi.y_offset], [0, 0, 0]])
         camera = Camera(width, height, matrix - offset, distortion, model)
         return camera if bins == (1, 1) else camera.scaled(width // bins[0], height // bins[1])
@@ -246,24 +251,24 @@ def decode_camera(message: CameraInfo, rectified: bool = False) -> Camera:
         raise ValueError(f"camera_info cannot be used: {error}") from error
 
 
-def decode_picture(message: Image | CompressedImage) -> np.ndarray:
-    """Pixels (H, W, 3) uint8 RGB of an image message of either type.
+def decode_picture(message: AnyImage) -> np.ndarray:
+    """Return the pixels (H, W, 3) uint8 RGB of an image message of either type.
 
     Raises:
         ValueError: see decode_image and decode_compressed_image.
     """
-    return decode_compressed_image(message) if hasattr(message, "format") else decode_image(message)
+    return decode_compressed_image(message) if isinstance(message, CompressedImage) else decode_image(message)
 
 
-def decode_pose(message: PoseStamped | PoseWithCovarianceStamped | Odometry, name: str) -> np.ndarray:
-    """Pose (4, 4) of a message in the frame that its header names.
+def decode_pose(message: AnyPose | Odometry, name: str) -> np.ndarray:
+    """Return the pose (4, 4) of a message in the frame that its header names.
 
     A quaternion that is not of unit length is normalised. `name` is what errors call the message.
 
     Raises:
         ValueError: a value that is not finite, or a quaternion of zeros.
     """
-    pose = getattr(message.pose, "pose", message.pose)
+    pose: Pose = getattr(message.pose, "pose", message.pose)
     position, orientation = pose.position, pose.orientation
     translation = np.array([position.x, position.y, position.z])
     quaternion = np.array([orientation.x, orientation.y, orientation.z, orientation.w])
@@ -277,8 +282,8 @@ def decode_pose(message: PoseStamped | PoseWithCovarianceStamped | Odometry, nam
         raise ValueError(f"{name} cannot be used: {error}") from error
 
 
-def decode_covariance(message: PoseStamped | PoseWithCovarianceStamped, name: str) -> np.ndarray | None:
-    """Covariance (6, 6) of a pose, in ROS order; None for a pose without one, or with zeros, the mark of unknown.
+def decode_covariance(message: AnyPose, name: str) -> np.ndarray | None:
+    """Return the covariance (6, 6) of a pose in ROS order; None for a pose without one, or with zeros: unknown.
 
     Raises:
         ValueError: a value that is not finite, or a negative variance.
@@ -296,5 +301,5 @@ def decode_covariance(message: PoseStamped | PoseWithCovarianceStamped, name: st
 
 
 def nanoseconds(stamp: Time) -> int:
-    """A stamp in nanoseconds."""
+    """Return a stamp in nanoseconds."""
     return stamp.sec * 1_000_000_000 + stamp.nanosec

@@ -1,4 +1,4 @@
-"""How the robot has moved of late, as its odometry says."""
+"""How the robot has moved of late, by its odometry."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ import numpy as np
 
 from gsfeatloc_ros.common.geometry import interpolate, invert
 
-# Where the odometry was silent for longer than this, in nanoseconds, it does not say where the robot was.
-_GAP = 200_000_000
-# Stamps that go back farther than this are those of another run (a looped bag, a simulation started anew).
-_RESTART = 1_000_000_000
+# Nanoseconds. Farther than this from a message the odometry does not say where the robot was.
+_MAX_DISTANCE = 200_000_000
+# Nanoseconds. Stamps that go back farther than this are those of another run (a looped bag, a simulation started anew).
+_MAX_DISORDER = 1_000_000_000
 
 
 class Odometry:
@@ -31,7 +31,7 @@ class Odometry:
     def add(self, stamp: int, pose: np.ndarray) -> None:
         """Take the pose T_odom_body (4, 4) at `stamp` (nanoseconds); one that comes out of order is left out."""
         with self._lock:
-            if self._stamps and stamp < self._stamps[-1] - _RESTART:
+            if self._stamps and stamp < self._stamps[-1] - _MAX_DISORDER:
                 self._stamps, self._poses = [], []
             if self._stamps and stamp <= self._stamps[-1]:
                 return
@@ -43,13 +43,13 @@ class Odometry:
                 del self._stamps[:first], self._poses[:first]
 
     def forget_after(self, stamp: int) -> None:
-        """Leave out what is stamped later than `stamp` (nanoseconds)."""
+        """Forget what is stamped later than `stamp` (nanoseconds)."""
         with self._lock:
             end = bisect_left(self._stamps, stamp)
             del self._stamps[end:], self._poses[end:]
 
     def motion(self, start: int, end: int) -> np.ndarray | None:
-        """Pose (4, 4) of the body at `end` in the body's frame at `start` (nanoseconds).
+        """Return the pose (4, 4) of the body at `end` in the body's frame at `start` (nanoseconds).
 
         None where it is not known, because nothing came near one of the two times.
         """
@@ -61,7 +61,10 @@ class Odometry:
         after = bisect_left(self._stamps, stamp)
         if 0 < after < len(self._stamps):
             low, high = self._stamps[after - 1], self._stamps[after]
-            if high - low <= 2 * _GAP:
+            if high - low <= 2 * _MAX_DISTANCE:
                 return interpolate(self._poses[after - 1], self._poses[after], (stamp - low) / (high - low))
-        near = [i for i in (after - 1, after) if 0 <= i < len(self._stamps) and abs(self._stamps[i] - stamp) <= _GAP]
-        return self._poses[min(near, key=lambda i: abs(self._stamps[i] - stamp))] if near else None
+        neighbours = [i for i in (after - 1, after) if 0 <= i < len(self._stamps)]
+        nearest = min(neighbours, key=lambda i: abs(self._stamps[i] - stamp), default=None)
+        if nearest is None or abs(self._stamps[nearest] - stamp) > _MAX_DISTANCE:
+            return None
+        return self._poses[nearest]

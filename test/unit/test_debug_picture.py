@@ -7,8 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.photo import Photo
-from gsfeatloc_ros.localize.estimate import Estimate, Status
+from gsfeatloc_ros.localize.estimate import Estimate, Status, Trace
+from gsfeatloc_ros.localize.evidence import Evidence
 from gsfeatloc_ros.localize.localizer import Localizer
 from gsfeatloc_ros.match import create_matcher
 from gsfeatloc_ros.match.base import Matches
@@ -32,16 +34,19 @@ def matches(a: list[list[float]], b: list[list[float]]) -> Matches:
     return Matches(np.array(a, dtype=float), np.array(b, dtype=float), np.ones(len(a)))
 
 
-def localized(correspondences: Matches, width: int = 640, height: int = 480) -> Estimate:
-    return Estimate(
-        Status.LOCALIZED,
-        "found",
-        T_map_camera=np.eye(4),
-        covariance=np.diag([1e-6] * 6),
-        inliers=len(correspondences),
-        correspondences=correspondences,
-        last_render=grey_render(width, height),
-    )
+def grey_photo(width: int = 640, height: int = 480) -> Photo:
+    return Photo(grey(width, height), np.ones((height, width), bool), Camera(width, height, np.eye(3)))
+
+
+def nothing(estimate: Estimate = FAILED) -> Trace:
+    """Nothing was matched with a grey photo."""
+    return Trace(estimate, grey_photo())
+
+
+def localized(correspondences: Matches, width: int = 640, height: int = 480) -> Trace:
+    evidence = Evidence(inliers=len(correspondences))
+    estimate = Estimate(Status.LOCALIZED, "found", np.eye(4), np.diag([1e-6] * 6), evidence)
+    return Trace(estimate, grey_photo(width, height), grey_render(width, height), correspondences)
 
 
 def badge(picture: np.ndarray) -> tuple[int, int, int]:
@@ -53,7 +58,7 @@ def badge(picture: np.ndarray) -> tuple[int, int, int]:
 
 
 def test_nothing_was_matched():
-    picture = draw(grey(640, 480), FAILED)
+    picture = draw(nothing())
     assert picture.dtype == np.uint8
     assert picture.shape[1:] == (1280, 3)
     np.testing.assert_array_equal(picture[30:480, :640], 128)
@@ -62,7 +67,7 @@ def test_nothing_was_matched():
 
 
 def test_no_inliers():
-    plain = draw(grey(640, 480), localized(Matches.none()))
+    plain = draw(localized(Matches.none()))
     np.testing.assert_array_equal(plain[30:480, :640], 128)
     np.testing.assert_array_equal(plain[30:480, 640:], 64)
 
@@ -72,8 +77,8 @@ def test_a_match_has_a_ring_at_both_ends(width: int):
     """Pixel centres are integers, so a pixel p of an image drawn s times as large is at s (p + 0.5) - 0.5."""
     height, scale = 3 * width // 4, 640 / width
     a, b = np.array([0.3, 0.4]) * [width, height], np.array([0.6, 0.8]) * [width, height]
-    one = draw(grey(width, height), localized(matches([a], [b]), width, height)).astype(int)
-    none = draw(grey(width, height), localized(Matches.none(), width, height)).astype(int)
+    one = draw(localized(matches([a], [b]), width, height)).astype(int)
+    none = draw(localized(Matches.none(), width, height)).astype(int)
     rows, columns = np.nonzero(np.abs(one - none).sum(axis=2)[:480] > 60)
     left, right = scale * (a + 0.5) - 0.5 - 3, scale * (b + 0.5) - 0.5 + [640, 0] + 3
     assert [columns.min(), rows.min()] == pytest.approx(left, abs=1)
@@ -81,7 +86,7 @@ def test_a_match_has_a_ring_at_both_ends(width: int):
 
 
 def test_both_ends_of_a_match_have_its_colour():
-    picture = draw(grey(640, 480), localized(matches([[100, 100], [500, 300]], [[200, 200], [400, 400]]))).astype(int)
+    picture = draw(localized(matches([[100, 100], [500, 300]], [[200, 200], [400, 400]]))).astype(int)
 
     def colour(x: int, y: int) -> np.ndarray:
         patch = picture[y - 4 : y + 5, x - 4 : x + 5].reshape(-1, 3)
@@ -97,28 +102,26 @@ def test_six_hundred_inliers_hide_less_than_a_third():
     rng = np.random.default_rng(0)
     a = rng.uniform(0, [640, 480], (600, 2))
     correspondences = matches(a, a + rng.normal(0, 1, a.shape))
-    drawn, plain = (draw(grey(640, 480), localized(m))[30:480] for m in (correspondences, Matches.none()))
+    drawn, plain = (draw(localized(m))[30:480] for m in (correspondences, Matches.none()))
     assert np.mean((drawn != plain).any(axis=2)) < 1 / 3
 
 
 def test_the_status_has_its_colour():
-    photo = grey(640, 480)
-    red, green, blue = badge(draw(photo, localized(Matches.none())))
+    red, green, blue = badge(draw(localized(Matches.none())))
     assert green > 1.5 * max(red, blue)
-    red, green, blue = badge(draw(photo, Estimate(Status.REJECTED, "no", last_render=grey_render(640, 480))))
+    red, green, blue = badge(draw(replace(nothing(Estimate(Status.REJECTED, "no")), render=grey_render(640, 480))))
     assert red > green > 2 * blue
-    for picture in (draw(photo, FAILED), draw_refused(photo, "no prior yet")):
+    for picture in (draw(nothing()), draw_refused(grey(640, 480), "no prior yet")):
         red, green, blue = badge(picture)
         assert red > 2 * max(green, blue)
 
 
 def test_pictures_of_one_camera_have_one_size():
-    photo = grey(640, 480)
     pictures = [
-        draw(photo, FAILED),
-        draw(photo, localized(matches([[1, 2]], [[3, 4]]))),
-        draw(photo, replace(FAILED, reason="word " * 40, milliseconds={"prepare": 2.0, "total": 1234.5})),
-        draw_refused(photo, ""),
+        draw(nothing()),
+        draw(localized(matches([[1, 2]], [[3, 4]]))),
+        draw(nothing(replace(FAILED, reason="word " * 40, milliseconds={"prepare": 2.0, "total": 1234.5}))),
+        draw_refused(grey(640, 480), ""),
         draw_refused(grey(1280, 960), "camera_info is for 640x480 but the image is 1280x960"),
     ]
     assert {picture.shape for picture in pictures} == {pictures[0].shape}
@@ -155,23 +158,34 @@ def test_photos_of_any_shape(width: int, height: int):
 
 
 def test_the_photo_is_not_drawn_on():
-    photo, estimate = grey(640, 480), localized(matches([[100, 100]], [[100, 100]]))
-    draw(photo, estimate)
-    draw_refused(photo, "no prior yet")
-    assert (photo == 128).all()
-    assert (estimate.last_render.rgb == 0.25).all()
+    trace = localized(matches([[100, 100]], [[100, 100]]))
+    draw(trace)
+    draw_refused(trace.photo.image, "no prior yet")
+    assert (trace.photo.image == 128).all()
+    assert (trace.render.rgb == 0.25).all()
+
+
+def test_every_number_of_the_evidence_is_drawn_in_one_row():
+    """Fields end before the margin, with all that can be there: evidence, stages and standard deviations."""
+    stages = ("prepare", "features", "render", "match", "solve", "track", "verify", "total")
+    trace = localized(Matches.none())
+    evidence = Evidence(800, 800, 800, 800, 0.999, 1.0, -0.999, 10.123, 100.123, 20, 1000)
+    estimate = replace(trace.estimate, evidence=evidence, milliseconds=dict.fromkeys(stages, 12345.0))
+    band = draw(replace(trace, estimate=estimate))[480:]
+    assert (band[:, -10:] == band[0, 0]).all()
+    less = draw(replace(trace, estimate=replace(estimate, evidence=replace(evidence, views=0))))[480:]
+    # The last of them can be seen.
+    assert (less != band).any()
 
 
 def test_a_localized_photo_of_the_room(room_map, room_camera, room_photos):
     simulated = room_photos[0]
-    estimate = Localizer(create_renderer(room_map), create_matcher("sift")).localize(
-        simulated.image, room_camera, simulated.T_map_camera_prior
-    )
-    assert estimate.localized
-    photo = Photo.undistorted(simulated.image, room_camera, 640).image
-    picture = draw(photo, estimate)
+    localizer = Localizer(create_renderer(room_map), create_matcher("sift"))
+    trace = localizer.trace(simulated.image, room_camera, simulated.T_map_camera_prior)
+    assert trace.estimate.localized
+    picture = draw(trace)
     _, green, _ = badge(picture)
     assert green > 100
     # Photo and render are there behind what is drawn on them.
-    for half, image in ((picture[30:480, :640], photo), (picture[30:480, 640:], estimate.last_render.image())):
+    for half, image in ((picture[30:480, :640], trace.photo.image), (picture[30:480, 640:], trace.render.image())):
         assert np.mean((half == image[30:]).all(axis=2)) > 0.5

@@ -10,7 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gsfeatloc_ros.common.geometry import interpolate, invert, make_pose, quaternion_from_matrix, so3_exp, so3_log
-from gsfeatloc_ros.ros_io.inputs import Inputs, PriorPolicy
+from gsfeatloc_ros.ros_io.inputs import Inputs, InputTopic
+from gsfeatloc_ros.ros_io.prior import PriorPolicy, PriorSource, decode_prior
 
 SECOND = 1_000_000_000
 # The base looks along x, with z up; the camera is in front, higher, and looks ahead with z.
@@ -78,51 +79,51 @@ def lookup(target: str, source: str, at: int) -> np.ndarray:
 
 def inputs(**policy: object) -> Inputs:
     made = Inputs(PriorPolicy(**policy), lookup, False, "no camera_info yet", "no prior yet")
-    made.take_camera_info(camera_info())
+    made.take(InputTopic.CAMERA_INFO, camera_info())
     return made
 
 
 def asked(made: Inputs, seconds: float, frame: str = "camera") -> np.ndarray:
-    return made.query(image(seconds, frame)).T_map_camera_prior
+    return made.for_image(image(seconds, frame)).T_map_camera_prior
 
 
 def test_nothing_has_come():
     empty = Inputs(PriorPolicy(), lookup, False, "no camera_info yet", "no prior yet")
     assert empty.missing == ["no camera_info yet", "no prior yet"]
     with pytest.raises(ValueError, match="no camera_info yet"):
-        empty.query(image(1))
-    empty.take_camera_info(camera_info())
+        empty.for_image(image(1))
+    empty.take(InputTopic.CAMERA_INFO, camera_info())
     assert empty.missing == ["no prior yet"]
     with pytest.raises(ValueError, match="no prior yet"):
-        empty.query(image(1))
+        empty.for_image(image(1))
 
 
 @given(pose=poses)
 def test_a_prior_of_the_camera_in_the_map_frame_is_taken_as_it_is(pose):
     made = inputs()
-    made.take_prior(prior(1, pose))
-    query = made.query(image(1, frame=""))
-    np.testing.assert_allclose(query.T_map_camera_prior, pose, atol=1e-9)
-    assert query.prior_covariance is None
-    assert query.image.shape == (6, 8, 3)
+    made.take(InputTopic.PRIOR, prior(1, pose))
+    taken = made.for_image(image(1, frame=""))
+    np.testing.assert_allclose(taken.T_map_camera_prior, pose, atol=1e-9)
+    assert taken.prior_covariance is None
+    assert taken.image.shape == (6, 8, 3)
 
 
 @given(pose=poses)
 def test_a_prior_of_the_base_in_another_frame_goes_by_tf(pose):
     made = inputs(of_base=True)
-    made.take_prior(prior(1, pose, "odom"))
+    made.take(InputTopic.PRIOR, prior(1, pose, "odom"))
     np.testing.assert_allclose(asked(made, 1), T_MAP_ODOM @ pose @ T_BASE_CAMERA, atol=1e-9)
 
 
 def test_a_prior_in_a_moving_frame_is_of_its_own_time():
     made = inputs()
-    made.take_prior(prior(3, np.eye(4), "base_link"))
+    made.take(InputTopic.PRIOR, prior(3, np.eye(4), "base_link"))
     np.testing.assert_allclose(asked(made, 4), lookup("map", "base_link", 3 * SECOND), atol=1e-9)
 
 
 def test_initialpose_is_of_the_base_whatever_priors_are_of():
     made = inputs(of_base=False)
-    made.take_prior(prior(1, np.eye(4)), "initialpose")
+    made.take(InputTopic.INITIAL_POSE, prior(1, np.eye(4)))
     np.testing.assert_allclose(asked(made, 1), T_BASE_CAMERA, atol=1e-12)
 
 
@@ -130,16 +131,16 @@ def test_initialpose_is_of_the_base_whatever_priors_are_of():
 def test_the_covariance_goes_with_the_pose(pose, root):
     """Against moving the base by small steps of which the covariance is made, and seeing where the camera goes."""
     made = inputs(of_base=True)
-    made.take_prior(prior(1, pose, "odom", 1e-8 * root @ root.T + 1e-12 * np.eye(6)))
-    query = made.query(image(1))
-    camera, columns = query.T_map_camera_prior, []
+    made.take(InputTopic.PRIOR, prior(1, pose, "odom", 1e-8 * root @ root.T + 1e-12 * np.eye(6)))
+    taken = made.for_image(image(1))
+    camera, columns = taken.T_map_camera_prior, []
     for step in (1e-4 * root).T:
         moved = make_pose(so3_exp(step[3:]) @ pose[:3, :3], pose[:3, 3] + step[:3])
         there = T_MAP_ODOM @ moved @ T_BASE_CAMERA
         rotation = so3_log(there[:3, :3] @ camera[:3, :3].T)
         columns.append(np.concatenate([there[:3, 3] - camera[:3, 3], rotation]))
     expected = np.array(columns).T @ np.array(columns)
-    np.testing.assert_allclose(query.prior_covariance, expected, atol=2e-3 * max(np.abs(expected).max(), 1e-8))
+    np.testing.assert_allclose(taken.prior_covariance, expected, atol=2e-3 * max(np.abs(expected).max(), 1e-8))
 
 
 @pytest.mark.parametrize(
@@ -156,34 +157,60 @@ def test_a_prior_that_cannot_be_used(changes, says):
     arguments = {"seconds": 1, "pose": np.eye(4)} | changes
 
     def take_and_ask():
-        made.take_prior(prior(**arguments))
-        made.query(image(1))
+        made.take(InputTopic.PRIOR, prior(**arguments))
+        made.for_image(image(1))
 
     with pytest.raises(ValueError, match=says):
         take_and_ask()
 
 
-def test_what_is_lost_does_not_leave_the_old_in_its_place():
+BAD_POSE = make_pose(np.eye(3), [np.nan, 0, 0])
+
+
+@pytest.mark.parametrize("topic", [InputTopic.PRIOR, InputTopic.INITIAL_POSE])
+def test_a_prior_that_cannot_be_used_takes_the_place_of_a_good_one(topic):
     made = inputs()
-    made.take_prior(prior(1, np.eye(4)))
-    made.lose("prior", "a bad prior")
-    with pytest.raises(ValueError, match="a bad prior"):
-        made.query(image(1))
-    made.take_prior(prior(1, np.eye(4)))
-    made.lose("camera_info", "a bad camera")
-    with pytest.raises(ValueError, match="a bad camera"):
-        made.query(image(1))
-    made.take_camera_info(camera_info())
-    made.lose("odom", "a bad odometry")
-    made.query(image(1))
+    made.take(InputTopic.PRIOR, prior(1, np.eye(4)))
+    with pytest.raises(ValueError, match=f"^{topic.value} has position .* must be finite") as error:
+        made.take(topic, prior(2, BAD_POSE))
+    assert made.missing == [str(error.value)]
+    with pytest.raises(ValueError, match="must be finite"):
+        made.for_image(image(1))
+
+
+def test_a_camera_info_that_cannot_be_used_takes_the_place_of_a_good_one():
+    made = inputs()
+    made.take(InputTopic.PRIOR, prior(1, np.eye(4)))
+    with pytest.raises(ValueError, match="must be positive"):
+        made.take(InputTopic.CAMERA_INFO, camera_info(width=0))
+    with pytest.raises(ValueError, match="must be positive"):
+        made.for_image(image(1))
+
+
+def test_odometry_that_cannot_be_used_leaves_the_older_in_its_place():
+    made = inputs(of_base=True)
+    made.take(InputTopic.PRIOR, prior(100, T_MAP_ODOM))
+    drive(made, 99, 105)
+    with pytest.raises(ValueError, match=r"^odom has position .* must be finite"):
+        made.take(InputTopic.ODOMETRY, odometry(105.05, BAD_POSE))
+    ahead = make_pose(np.eye(3), [5, 0, 0])
+    np.testing.assert_allclose(asked(made, 105), T_MAP_ODOM @ ahead @ T_BASE_CAMERA, atol=1e-9)
+
+
+def test_what_is_invalidated_says_why():
+    made = inputs()
+    made.take(InputTopic.PRIOR, prior(1, np.eye(4)))
+    for topic in InputTopic:
+        made.invalidate(topic, f"a bad {topic.value}")
+    assert made.missing == ["a bad camera_info", "a bad initialpose"]
 
 
 def test_an_image_of_another_size_than_the_camera():
     made = inputs()
-    made.take_camera_info(camera_info(width=16))
-    made.take_prior(prior(1, np.eye(4)))
+    made.take(InputTopic.CAMERA_INFO, camera_info(width=16))
+    made.take(InputTopic.PRIOR, prior(1, np.eye(4)))
     with pytest.raises(ValueError, match="camera_info is for 16x6 but the image is 8x6"):
-        made.query(image(1))
+        made.for_image(image(1))
 
 
 @pytest.mark.parametrize(
@@ -195,9 +222,9 @@ def test_an_image_of_another_size_than_the_camera():
 )
 def test_a_prior_too_old_or_of_the_future(seconds, says):
     made = inputs()
-    made.take_prior(prior(100, np.eye(4)))
+    made.take(InputTopic.PRIOR, prior(100, np.eye(4)))
     with pytest.raises(ValueError, match=says):
-        made.query(image(seconds))
+        made.for_image(image(seconds))
     np.testing.assert_array_equal(asked(made, 109.9), np.eye(4))
     np.testing.assert_array_equal(asked(made, 90.1), np.eye(4))
 
@@ -205,25 +232,25 @@ def test_a_prior_too_old_or_of_the_future(seconds, says):
 @pytest.mark.parametrize(("prior_seconds", "image_seconds"), [(0, 1e6), (100, 0)])
 def test_without_a_stamp_there_is_no_age(prior_seconds, image_seconds):
     made = inputs()
-    made.take_prior(prior(prior_seconds, np.eye(4)))
+    made.take(InputTopic.PRIOR, prior(prior_seconds, np.eye(4)))
     np.testing.assert_array_equal(asked(made, image_seconds), np.eye(4))
 
 
 def test_no_limit_on_the_age():
     made = inputs(max_age=0.0)
-    made.take_prior(prior(100, np.eye(4)))
+    made.take(InputTopic.PRIOR, prior(100, np.eye(4)))
     np.testing.assert_array_equal(asked(made, 1e6), np.eye(4))
 
 
 def drive(made: Inputs, start: float, end: float, child: str = "base_link") -> None:
     """Odometry of a robot that moves along x of its own at 1 m/s, and does not turn."""
     for seconds in np.arange(start, end + 0.01, 0.05):
-        made.take_odometry(odometry(seconds, make_pose(np.eye(3), [seconds, 0, 0]), child))
+        made.take(InputTopic.ODOMETRY, odometry(seconds, make_pose(np.eye(3), [seconds, 0, 0]), child))
 
 
 def test_odometry_carries_a_prior_to_the_image():
     made = inputs(of_base=True)
-    made.take_prior(prior(100, T_MAP_ODOM))
+    made.take(InputTopic.PRIOR, prior(100, T_MAP_ODOM))
     drive(made, 99, 120)
     ahead = make_pose(np.eye(3), [17.5, 0, 0])
     np.testing.assert_allclose(asked(made, 117.5), T_MAP_ODOM @ ahead @ T_BASE_CAMERA, atol=1e-9)
@@ -231,34 +258,34 @@ def test_odometry_carries_a_prior_to_the_image():
 
 def test_odometry_of_the_camera_itself():
     made = inputs()
-    made.take_prior(prior(100, T_MAP_ODOM))
+    made.take(InputTopic.PRIOR, prior(100, T_MAP_ODOM))
     for seconds in np.arange(99, 110, 0.05):
         pose = make_pose(np.eye(3), [0, 0, seconds])
-        made.take_odometry(odometry(seconds, pose, "camera_of_no_tf"))
+        made.take(InputTopic.ODOMETRY, odometry(seconds, pose, "camera_of_no_tf"))
     with pytest.raises(ValueError, match="no way from camera to camera_of_no_tf"):
-        made.query(image(104))
+        made.for_image(image(104))
 
     same = Inputs(PriorPolicy(), lambda target, source, at: np.eye(4), False, "", "")
-    same.take_camera_info(camera_info())
-    same.take_prior(prior(100, T_MAP_ODOM))
+    same.take(InputTopic.CAMERA_INFO, camera_info())
+    same.take(InputTopic.PRIOR, prior(100, T_MAP_ODOM))
     for seconds in np.arange(99, 110, 0.05):
-        same.take_odometry(odometry(seconds, make_pose(np.eye(3), [0, 0, seconds]), "camera"))
+        same.take(InputTopic.ODOMETRY, odometry(seconds, make_pose(np.eye(3), [0, 0, seconds]), "camera"))
     np.testing.assert_allclose(asked(same, 104), T_MAP_ODOM @ make_pose(np.eye(3), [0, 0, 4]), atol=1e-9)
 
 
 def test_odometry_carries_no_farther_than_allowed():
     made = inputs(odometry_max_age=15.0)
-    made.take_prior(prior(100, np.eye(4)))
+    made.take(InputTopic.PRIOR, prior(100, np.eye(4)))
     drive(made, 99, 118)
     # Ahead is along z of the camera.
     assert asked(made, 114.9)[2, 3] == pytest.approx(14.9)
     with pytest.raises(ValueError, match=r"prior is 15\.1 s older"):
-        made.query(image(115.1))
+        made.for_image(image(115.1))
 
 
 def test_another_body_s_odometry_is_another_odometry():
     made = inputs()
-    made.take_prior(prior(100, np.eye(4)))
+    made.take(InputTopic.PRIOR, prior(100, np.eye(4)))
     drive(made, 99, 105)
     drive(made, 103, 106, child="wheel")
     # Nothing is known of the wheel at 100 s.
@@ -267,47 +294,49 @@ def test_another_body_s_odometry_is_another_odometry():
 
 def test_from_an_answer_it_goes_on_until_a_prior_comes():
     made = inputs()
-    made.take_prior(prior(100, np.eye(4)))
-    first = made.query(image(100))
-    made.take_answer(T_MAP_ODOM, 100 * SECOND, first.rough)
-    second = made.query(image(105))
+    made.take(InputTopic.PRIOR, prior(100, np.eye(4)))
+    first = made.for_image(image(100))
+    made.take_answer(T_MAP_ODOM, 100 * SECOND, first.prior)
+    second = made.for_image(image(105))
     np.testing.assert_array_equal(second.T_map_camera_prior, T_MAP_ODOM)
-    assert second.rough.name == "last answer"
+    assert second.prior.source is PriorSource.LAST_ANSWER
     with pytest.raises(ValueError, match=r"last answer is 11\.0 s older"):
-        made.query(image(111))
-    made.take_prior(prior(105, T_BASE_CAMERA))
+        made.for_image(image(111))
+    made.take(InputTopic.PRIOR, prior(105, T_BASE_CAMERA))
     np.testing.assert_allclose(asked(made, 105), T_BASE_CAMERA, atol=1e-12)
     # An answer to the image before is late: the prior came since.
-    made.take_answer(T_MAP_ODOM, 105 * SECOND, second.rough)
+    made.take_answer(T_MAP_ODOM, 105 * SECOND, second.prior)
     np.testing.assert_allclose(asked(made, 105), T_BASE_CAMERA, atol=1e-12)
 
 
 def test_the_answer_in_another_map_is_forgotten_but_not_a_prior():
     made = inputs()
-    made.take_prior(prior(100, np.eye(4)))
+    made.take(InputTopic.PRIOR, prior(100, np.eye(4)))
     made.forget_answer()
-    made.take_answer(T_MAP_ODOM, 100 * SECOND, made.query(image(100)).rough)
+    made.take_answer(T_MAP_ODOM, 100 * SECOND, made.for_image(image(100)).prior)
     made.forget_answer()
     assert made.missing == ["no prior yet"]
 
 
 def test_when_time_goes_back_the_future_is_forgotten():
     made = inputs()
-    made.take_prior(prior(100, np.eye(4)))
+    made.take(InputTopic.PRIOR, prior(100, np.eye(4)))
     drive(made, 99, 110)
     made.forget_after(20 * SECOND)
     with pytest.raises(ValueError, match="time went back: no prior yet"):
-        made.query(image(20))
-    made.take_prior(prior(19, np.eye(4)))
+        made.for_image(image(20))
+    made.take(InputTopic.PRIOR, prior(19, np.eye(4)))
     made.forget_after(20 * SECOND)
     np.testing.assert_array_equal(asked(made, 20), np.eye(4))
 
 
-def test_a_query_s_own_camera_and_prior_go_before_what_came():
+def test_a_request_s_own_camera_and_prior_go_before_what_came():
     made = inputs()
-    rough = made.rough_pose(prior(50, T_MAP_ODOM))
-    np.testing.assert_allclose(made.query(image(50), rough=rough).T_map_camera_prior, T_MAP_ODOM, atol=1e-12)
+    own = decode_prior(prior(50, T_MAP_ODOM), PriorSource.REQUEST, made.policy)
+    np.testing.assert_allclose(made.for_image(image(50), prior=own).T_map_camera_prior, T_MAP_ODOM, atol=1e-12)
     assert made.missing == ["no prior yet"]
+    with pytest.raises(ValueError, match=r"^request's prior is 50\.0 s older"):
+        made.for_image(image(100), prior=own)
 
 
 @given(a=poses, b=poses, share=st.floats(0, 1))

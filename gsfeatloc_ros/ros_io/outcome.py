@@ -1,0 +1,53 @@
+"""What came of an image, in the node and in replay."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+from gsfeatloc_ros.localize.estimate import Estimate
+
+
+class OutcomeStatus(Enum):
+    """How it ended: as the Status of an Estimate, or without one. The value is what people read."""
+
+    LOCALIZED = "localized"
+    REJECTED = "rejected"
+    FAILED = "failed"
+    REFUSED = "refused"
+    ERROR = "error"
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What came of an image.
+
+    Attributes:
+        status: REFUSED: the image could not be tried. ERROR: a bug met on it, or no memory. Otherwise the estimate's.
+        reason: one sentence.
+        estimate: None if the image could not be tried.
+    """
+
+    status: OutcomeStatus
+    reason: str
+    estimate: Estimate | None = None
+
+    @staticmethod
+    def of(estimate: Estimate) -> Outcome:
+        """Return the outcome that an estimate is."""
+        return Outcome(OutcomeStatus(estimate.status.value), estimate.reason, estimate)
+
+    @staticmethod
+    def refused(reason: object) -> Outcome:
+        """Return the outcome of an image that could not be tried: why, in words or as an exception that has them."""
+        return Outcome(OutcomeStatus.REFUSED, str(reason))
+
+    @staticmethod
+    def error(exception: Exception) -> Outcome:
+        """Return the outcome of an image on which an exception was met that nobody foresaw."""
+        return Outcome(OutcomeStatus.ERROR, f"{type(exception).__name__}: {exception}")
+
+    @property
+    def localized(self) -> bool:
+        """Whether there is a pose to use."""
+        return self.status is OutcomeStatus.LOCALIZED
