@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from enum import Enum
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +14,23 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.typesys import Stores, get_typestore
 
 _POSES = ("geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
-COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
+
+
+class Role(Enum):
+    """What a topic is for. The value is what messages to people call it."""
+
+    IMAGE = "image"
+    CAMERA_INFO = "camera_info"
+    PRIOR = "prior"
+    TRUTH = "truth"
+
+
 # What messages are taken from the topic of each role.
-TYPES = {
-    "image": ("sensor_msgs/msg/Image", COMPRESSED_IMAGE),
-    "camera_info": ("sensor_msgs/msg/CameraInfo",),
-    "prior": _POSES,
-    "truth": (*_POSES, "nav_msgs/msg/Odometry"),
+_TYPES = {
+    Role.IMAGE: ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"),
+    Role.CAMERA_INFO: ("sensor_msgs/msg/CameraInfo",),
+    Role.PRIOR: _POSES,
+    Role.TRUTH: (*_POSES, "nav_msgs/msg/Odometry"),
 }
 
 
@@ -32,16 +43,14 @@ class Recorded:
     """A message as it was recorded.
 
     Attributes:
-        role: what it is for, one of TYPES.
+        role: what it is for.
         bag_time: when it was recorded, in nanoseconds.
-        kind: its type, e.g. "sensor_msgs/msg/Image".
         message: with the fields of its type; None if its bytes are not those of such a message.
         problem: why it is None.
     """
 
-    role: str
+    role: Role
     bag_time: int
-    kind: str
     message: Any
     problem: str = ""
 
@@ -62,10 +71,10 @@ class Bag:
     images: int
     seconds: float
     _reader: AnyReader
-    _roles: dict[str, list[str]]
+    _roles: dict[str, list[Role]]
 
     def messages(self) -> Iterator[Recorded]:
-        """The messages of all roles in the order in which they were recorded.
+        """Yield the messages of all roles in the order in which they were recorded.
 
         Raises:
             BagError: the bag is damaged from here on.
@@ -77,7 +86,7 @@ class Bag:
                 connection, bag_time, cdr = next(recorded)
             except StopIteration:
                 return
-            except Exception as error:  # of the decompressor, the database ...: rosbags passes on whatever comes
+            except Exception as error:  # rosbags passes on whatever the decompressor, the database ... raise
                 raise BagError(f"{self.path}: is damaged, and ends here: {_words(error)}") from error
             message, problem = None, ""
             try:
@@ -85,16 +94,16 @@ class Bag:
             except Exception as error:  # the same
                 problem = f"the bytes of this message are no {connection.msgtype}: {_words(error)}"
             for role in self._roles[connection.topic]:
-                yield Recorded(role, bag_time, connection.msgtype, message, problem)
+                yield Recorded(role, bag_time, message, problem)
 
 
 @contextmanager
-def open_bag(path: Path, topics: dict[str, str]) -> Iterator[Bag]:
+def open_bag(path: Path, topics: Mapping[Role, str]) -> Iterator[Bag]:
     """Open a rosbag2 (a folder, or one .mcap or .db3 file) and check that it has what is needed.
 
     Args:
         path: of the bag.
-        topics: topic of each role, one of TYPES.
+        topics: topic of each role that is wanted, the images' among them.
 
     Raises:
         BagError: the bag cannot be read, has no such topic, or messages of another type on it; or it has no images.
@@ -111,25 +120,25 @@ def open_bag(path: Path, topics: dict[str, str]) -> Iterator[Bag]:
             f"{path}: cannot be read: {_words(error)}; was its recording cut short? Try ros2 bag reindex"
         ) from error
     try:
-        roles: dict[str, list[str]] = {}
+        roles: dict[str, list[Role]] = {}
         for role, topic in topics.items():
             _check_topic(path, reader, role, topic)
             roles.setdefault(topic, []).append(role)
-        images = sum(connection.msgcount for connection in reader.connections if connection.topic == topics["image"])
+        images = sum(connection.msgcount for connection in reader.connections if connection.topic == topics[Role.IMAGE])
         if not images:
-            raise BagError(f"{path}: has no message on {topics['image']}")
+            raise BagError(f"{path}: has no message on {topics[Role.IMAGE]}")
         yield Bag(path, _storage(path), images, 1e-9 * reader.duration, reader, roles)
     finally:
         reader.close()
 
 
-def _check_topic(path: Path, reader: AnyReader, role: str, topic: str) -> None:
+def _check_topic(path: Path, reader: AnyReader, role: Role, topic: str) -> None:
     found = {connection.msgtype for connection in reader.connections if connection.topic == topic}
     if not found:
         there = sorted({f"{connection.topic} ({connection.msgtype})" for connection in reader.connections})
         raise BagError(f"{path}: has no topic {topic}; it has {', '.join(there) or 'none: it is empty'}")
-    if wrong := sorted(found.difference(TYPES[role])):
-        raise BagError(f"{path}: {topic} has {_either(wrong)}; {role} must be {_either(TYPES[role])}")
+    if wrong := sorted(found.difference(_TYPES[role])):
+        raise BagError(f"{path}: {topic} has {_either(wrong)}; {role.value} must be {_either(_TYPES[role])}")
 
 
 def _storage(path: Path) -> StoragePlugin:
@@ -142,5 +151,5 @@ def _either(kinds: Sequence[str]) -> str:
 
 
 def _words(error: Exception) -> str:
-    """What an error says, in one line; some say nothing."""
+    """Return what an error says, in one line; some say nothing, then its type."""
     return " ".join(str(error).split()).rstrip(".") or type(error).__name__

@@ -1,22 +1,23 @@
-"""A picture of how far off the answers are."""
+"""A picture of the errors of what was localized in a bag."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from gsfeatloc_ros.evaluate.extras import import_extra
 from gsfeatloc_ros.replay.output import errors
-from gsfeatloc_ros.replay.run import Answer
+from gsfeatloc_ros.replay.run import ReplayedImage
 from gsfeatloc_ros.replay.truth import Trajectory
 
 # Okabe and Ito's colours, which the colour-blind can tell apart.
 _ANSWER, _PRIOR, _NONE, _TRUTH = "#0072b2", "#e69f00", "#d55e00", "#8a94a0"
 
 
-def write_figure(path: Path, answers: Sequence[Answer], truth: Trajectory, map_frame: str) -> None:
+def write_figure(path: Path, images: Sequence[ReplayedImage], truth: Trajectory, map_frame: str) -> None:
     """Draw the errors of answers and priors over time, and the trajectory from above, into a .png.
 
     Images without an answer are marked below the errors.
@@ -28,11 +29,11 @@ def write_figure(path: Path, answers: Sequence[Answer], truth: Trajectory, map_f
     grid = figure.add_gridspec(2, 2, width_ratios=(1.5, 1))
     rotation = figure.add_subplot(grid[0, 0])
     translation = figure.add_subplot(grid[1, 0], sharex=rotation)
-    stamped = [answer for answer in answers if answer.stamp is not None]
-    start = min((answer.stamp for answer in stamped), default=0)
-    times = np.array([1e-9 * (answer.stamp - start) for answer in stamped])
-    values = [errors(answer, truth) for answer in stamped]
-    unanswered = np.array([not answer.localized for answer in stamped], dtype=bool)
+    stamped = [(image.stamp, image) for image in images if image.stamp is not None]
+    start = min((stamp for stamp, _ in stamped), default=0)
+    times = np.array([1e-9 * (stamp - start) for stamp, _ in stamped])
+    values = [errors(image, truth) for _, image in stamped]
+    unanswered = np.array([image.pose is None for _, image in stamped], dtype=bool)
     for axes, key, title in (
         (rotation, "rotation_error_deg", "Rotation error, degrees"),
         (translation, "translation_error", "Translation error, map units"),
@@ -51,12 +52,12 @@ def write_figure(path: Path, answers: Sequence[Answer], truth: Trajectory, map_f
     rotation.tick_params(labelbottom=False)
     translation.set_xlabel("seconds since the first image")
     rotation.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
-    _draw_from_above(figure.add_subplot(grid[:, 1]), answers, truth, map_frame)
+    _draw_from_above(figure.add_subplot(grid[:, 1]), images, truth, map_frame)
     figure.savefig(path, dpi=110)
 
 
-def _draw_from_above(axes: object, answers: Sequence[Answer], truth: Trajectory, map_frame: str) -> None:
-    positions = [answer.estimate.T_map_camera[:3, 3] for answer in answers if answer.localized]
+def _draw_from_above(axes: Any, images: Sequence[ReplayedImage], truth: Trajectory, map_frame: str) -> None:
+    positions = [image.pose.T_map_camera[:3, 3] for image in images if image.pose is not None]
     x, y = np.reshape(positions, (-1, 3))[:, :2].T
     axes.plot(*truth.positions[:, :2].T, color=_TRUTH, linewidth=1.5, label="truth")
     axes.plot(x, y, ".", color=_ANSWER, label="answers")

@@ -1,10 +1,10 @@
-"""The answers to a bag in files: TUM, CSV and a bag of their own."""
+"""What came of a bag's images in files: TUM, CSV and a bag of poses."""
 
 from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,14 +12,14 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from gsfeatloc_ros.common.geometry import quaternion_from_matrix, rotation_error_deg, translation_error
-from gsfeatloc_ros.replay.run import Answer
+from gsfeatloc_ros.localize.evidence import Evidence
+from gsfeatloc_ros.replay.run import ReplayedImage, StampedPose
 from gsfeatloc_ros.replay.truth import Trajectory
 
 POSE_TOPIC = "/pose"
 
 _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 _VARIANCES = ("var_x", "var_y", "var_z", "var_rx", "var_ry", "var_rz")
-_EVIDENCE = ("inliers", "inlier_ratio", "coverage", "agreement", "passes", "views")
 _ERRORS = (
     "rotation_error_deg",
     "translation_error",
@@ -28,12 +28,12 @@ _ERRORS = (
 )
 
 
-def errors(answer: Answer, truth: Trajectory) -> dict[str, float]:
-    """How far the answer and its prior are off, in degrees and map units; what is not known is left out."""
-    true_pose = None if answer.stamp is None else truth.at(answer.stamp)
+def errors(image: ReplayedImage, truth: Trajectory) -> dict[str, float]:
+    """Return the errors of an image's pose and of its prior, in degrees and map units; without those not known."""
+    true_pose = None if image.stamp is None else truth.at(image.stamp)
     if true_pose is None:
         return {}
-    poses = {"": answer.estimate and answer.estimate.T_map_camera, "prior_": answer.T_map_camera_prior}
+    poses = {"": image.pose and image.pose.T_map_camera, "prior_": image.T_map_camera_prior}
     values = {}
     for prefix, pose in poses.items():
         if pose is not None:
@@ -42,27 +42,27 @@ def errors(answer: Answer, truth: Trajectory) -> dict[str, float]:
     return values
 
 
-def write_tum(path: Path, answers: Sequence[Answer]) -> None:
-    """A line ``stamp x y z qx qy qz qw`` for each answer that has a pose."""
+def write_tum(path: Path, images: Sequence[ReplayedImage]) -> None:
+    """Write a line ``stamp x y z qx qy qz qw`` for each image that has a pose."""
     with path.open("w", encoding="utf-8") as file:
-        for answer in answers:
-            if answer.localized:
-                numbers = " ".join(f"{value:.9f}" for value in _pose_values(answer.estimate.T_map_camera))
-                print(_seconds(answer.stamp), numbers, file=file)
+        for pose in (image.pose for image in images):
+            if pose is not None:
+                numbers = " ".join(f"{value:.9f}" for value in _pose_values(pose.T_map_camera))
+                print(_seconds(pose.stamp), numbers, file=file)
 
 
-def write_csv(path: Path, answers: Sequence[Answer], truth: Trajectory | None) -> None:
-    """A line for each image; what is not known is empty. With `truth`, the errors too."""
-    names = ["stamp", "bag_time", "status", "reason", *_EVIDENCE, "ms", *_POSE, *_VARIANCES]
+def write_csv(path: Path, images: Sequence[ReplayedImage], truth: Trajectory | None) -> None:
+    """Write a line for each image; what is not known is empty. With `truth`, the errors too."""
+    names = ["stamp", "bag_time", "status", "reason", *Evidence().numbers(), "ms", *_POSE, *_VARIANCES]
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.DictWriter(file, names + (list(_ERRORS) if truth else []), lineterminator="\n")
         writer.writeheader()
-        for answer in answers:
-            writer.writerow(_row(answer) | (errors(answer, truth) if truth else {}))
+        for image in images:
+            writer.writerow(_row(image) | (errors(image, truth) if truth else {}))
 
 
-def write_bag(path: Path, storage: StoragePlugin, answers: Sequence[Answer], map_frame: str) -> None:
-    """Write a new rosbag2: a PoseWithCovarianceStamped on POSE_TOPIC for each answer that has a pose.
+def write_bag(path: Path, storage: StoragePlugin, images: Sequence[ReplayedImage], map_frame: str) -> None:
+    """Write a new rosbag2: a PoseWithCovarianceStamped on POSE_TOPIC for each image that has a pose.
 
     Its header has the stamp of the image, and it is recorded at the same time as the image, so that both bags can be
     played together.
@@ -71,51 +71,52 @@ def write_bag(path: Path, storage: StoragePlugin, answers: Sequence[Answer], map
     kind = "geometry_msgs/msg/PoseWithCovarianceStamped"
     with Writer(path, version=9, storage_plugin=storage) as writer:
         connection = writer.add_connection(POSE_TOPIC, kind, typestore=types)
-        for answer in answers:
-            if answer.localized:
-                message = _pose_message(types.types, answer, map_frame)
-                writer.write(connection, answer.bag_time, types.serialize_cdr(message, kind))
+        for image in images:
+            if image.pose is not None:
+                message = _pose_message(types.types, image.pose, map_frame)
+                writer.write(connection, image.bag_time, types.serialize_cdr(message, kind))
 
 
-def _row(answer: Answer) -> dict[str, object]:
+def _row(image: ReplayedImage) -> dict[str, object]:
+    outcome, pose = image.outcome, image.pose
     row: dict[str, object] = {
-        "stamp": "" if answer.stamp is None else _seconds(answer.stamp),
-        "bag_time": _seconds(answer.bag_time),
-        "status": answer.status,
-        "reason": answer.reason,
+        "stamp": "" if image.stamp is None else _seconds(image.stamp),
+        "bag_time": _seconds(image.bag_time),
+        "status": outcome.status.value,
+        "reason": outcome.reason,
     }
-    estimate = answer.estimate
-    if estimate:
-        numbers = {name: getattr(estimate, name) for name in _EVIDENCE}
-        row |= {name: "" if math.isnan(value) else value for name, value in numbers.items()}
-        row["ms"] = f"{estimate.milliseconds['total']:.1f}"
-    if answer.localized:
-        row |= zip(_POSE, _pose_values(estimate.T_map_camera), strict=True)
-        row |= zip(_VARIANCES, estimate.covariance.diagonal().tolist(), strict=True)
+    if outcome.estimate is not None:
+        numbers = outcome.estimate.evidence.numbers()
+        row |= {name: "" if math.isnan(number) else number for name, number in numbers.items()}
+        row["ms"] = f"{outcome.estimate.milliseconds['total']:.1f}"
+    if pose is not None:
+        row |= zip(_POSE, _pose_values(pose.T_map_camera), strict=True)
+        row |= zip(_VARIANCES, pose.covariance.diagonal().tolist(), strict=True)
     return row
 
 
 def _pose_values(pose: np.ndarray) -> list[float]:
-    """x y z qx qy qz qw of a pose (4, 4)."""
+    """Return x y z qx qy qz qw of a pose (4, 4)."""
     return [*pose[:3, 3].tolist(), *quaternion_from_matrix(pose[:3, :3]).tolist()]
 
 
-def _pose_message(types: dict[str, type], answer: Answer, map_frame: str) -> object:
-    seconds, rest = divmod(answer.stamp, 1_000_000_000)
-    values = _pose_values(answer.estimate.T_map_camera)
-    pose = types["geometry_msgs/msg/Pose"](
-        position=types["geometry_msgs/msg/Point"](*values[:3]),
-        orientation=types["geometry_msgs/msg/Quaternion"](*values[3:]),
-    )
+def _pose_message(types: Mapping[str, type], pose: StampedPose, map_frame: str) -> object:
+    seconds, rest = divmod(pose.stamp, 1_000_000_000)
+    values = _pose_values(pose.T_map_camera)
     stamp = types["builtin_interfaces/msg/Time"](sec=seconds, nanosec=rest)
+    position = types["geometry_msgs/msg/Point"](*values[:3])
+    orientation = types["geometry_msgs/msg/Quaternion"](*values[3:])
     return types["geometry_msgs/msg/PoseWithCovarianceStamped"](
         header=types["std_msgs/msg/Header"](stamp=stamp, frame_id=map_frame),
-        pose=types["geometry_msgs/msg/PoseWithCovariance"](pose=pose, covariance=answer.estimate.covariance.ravel()),
+        pose=types["geometry_msgs/msg/PoseWithCovariance"](
+            pose=types["geometry_msgs/msg/Pose"](position=position, orientation=orientation),
+            covariance=pose.covariance.ravel(),
+        ),
     )
 
 
 def _seconds(nanoseconds: int) -> str:
-    """Exact, with nine decimals."""
+    """Return nanoseconds as seconds with nine decimals, exact."""
     sign = "-" if nanoseconds < 0 else ""
     seconds, rest = divmod(abs(nanoseconds), 1_000_000_000)
     return f"{sign}{seconds}.{rest:09d}"

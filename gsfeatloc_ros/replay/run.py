@@ -4,42 +4,58 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
-from gsfeatloc_ros.localize.estimate import Estimate
 from gsfeatloc_ros.localize.localizer import Localizer
-from gsfeatloc_ros.replay.bag import Bag, Recorded
+from gsfeatloc_ros.replay.bag import Bag, Recorded, Role
 from gsfeatloc_ros.ros_io.decode import decode_pose, nanoseconds
-from gsfeatloc_ros.ros_io.inputs import Inputs, PriorPolicy
+from gsfeatloc_ros.ros_io.inputs import Inputs, InputTopic
+from gsfeatloc_ros.ros_io.outcome import Outcome
+from gsfeatloc_ros.ros_io.prior import PriorPolicy
+
+_INPUT_TOPICS = {Role.CAMERA_INFO: InputTopic.CAMERA_INFO, Role.PRIOR: InputTopic.PRIOR}
 
 
 @dataclass(frozen=True, eq=False)
-class Answer:
-    """What came of an image.
+class StampedPose:
+    """The pose of an image that was localized.
+
+    Attributes:
+        stamp: of the image, in nanoseconds.
+        T_map_camera: (4, 4).
+        covariance: (6, 6) in ROS order.
+    """
+
+    stamp: int
+    T_map_camera: np.ndarray
+    covariance: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class ReplayedImage:
+    """What came of an image of the bag.
 
     Attributes:
         bag_time: when the image was recorded, in nanoseconds.
         stamp: of the image, in nanoseconds; None where it could not be read.
-        status: that of the Estimate in words; "refused" if the image could not be tried, "error" for a bug met on it.
-        reason: one sentence in words.
-        T_map_camera_prior: (4, 4) prior it was tried with, else None.
-        estimate: without its pictures; None where it was not tried.
+        outcome: of its localization.
+        T_map_camera_prior: (4, 4) prior it was tried with; None where it was not tried.
     """
 
     bag_time: int
     stamp: int | None
-    status: str
-    reason: str
+    outcome: Outcome
     T_map_camera_prior: np.ndarray | None = None
-    estimate: Estimate | None = None
 
     @property
-    def localized(self) -> bool:
-        """Whether there is a pose to use."""
-        return self.estimate is not None and self.estimate.localized
+    def pose(self) -> StampedPose | None:
+        """Where it was taken; None unless it was localized."""
+        estimate = self.outcome.estimate
+        if estimate is None or estimate.T_map_camera is None or estimate.covariance is None or self.stamp is None:
+            return None
+        return StampedPose(self.stamp, estimate.T_map_camera, estimate.covariance)
 
 
 class Replay:
@@ -70,58 +86,56 @@ class Replay:
             "no prior was recorded before this image",
         )
         self.truth: list[tuple[int, np.ndarray]] = []
-        self.unusable: Counter[tuple[str, str]] = Counter()
+        self.unusable: Counter[tuple[Role, str]] = Counter()
 
-    def answers(self) -> Iterator[Answer]:
-        """What comes of each image, in the order in which they were recorded.
+    def images(self) -> Iterator[ReplayedImage]:
+        """Localize the images in the order in which they were recorded, and yield what comes of each.
 
         Raises:
             BagError: the bag is damaged from here on.
         """
-        take = {
-            "camera_info": self._inputs.take_camera_info,
-            "prior": self._inputs.take_prior,
-            "truth": self._take_truth,
-        }
         for recorded in self._bag.messages():
-            if recorded.role == "image":
+            if recorded.role is Role.IMAGE:
                 yield self._attempt(recorded)
                 continue
             try:
-                take[recorded.role](_content(recorded))
+                self._take(recorded)
             except ValueError as error:
                 self.unusable[recorded.role, str(error)] += 1
-                self._inputs.lose(recorded.role, str(error))
 
-    def _take_truth(self, message: Any) -> None:
-        map_frame = self._inputs.policy.map_frame
-        if message.header.frame_id != map_frame:
-            raise ValueError(f"truth is in frame {message.header.frame_id!r} but the map is in {map_frame!r}")
-        self.truth.append((nanoseconds(message.header.stamp), decode_pose(message, "truth")))
+    def _take(self, recorded: Recorded) -> None:
+        """Take a message that is no image; raise ValueError where it cannot be used."""
+        topic = _INPUT_TOPICS.get(recorded.role)
+        if recorded.message is None:
+            if topic is not None:
+                self._inputs.invalidate(topic, recorded.problem)
+            raise ValueError(recorded.problem)
+        if topic is not None:
+            self._inputs.take(topic, recorded.message)
+            return
+        header, map_frame = recorded.message.header, self._inputs.policy.map_frame
+        if header.frame_id != map_frame:
+            raise ValueError(f"truth is in frame {header.frame_id!r} but the map is in {map_frame!r}")
+        self.truth.append((nanoseconds(header.stamp), decode_pose(recorded.message, recorded.role.value)))
 
-    def _attempt(self, recorded: Recorded) -> Answer:
-        stamp = None if recorded.message is None else nanoseconds(recorded.message.header.stamp)
+    def _attempt(self, recorded: Recorded) -> ReplayedImage:
+        if recorded.message is None:
+            return ReplayedImage(recorded.bag_time, None, Outcome.refused(recorded.problem))
+        stamp = nanoseconds(recorded.message.header.stamp)
         try:
-            return self._localize(recorded, stamp)
+            outcome, prior = self._localize(recorded)
         except Exception as error:  # as in the node: not foreseen, and the next image may well do
-            return Answer(recorded.bag_time, stamp, "error", f"{type(error).__name__}: {error}")
+            outcome, prior = Outcome.error(error), None
+        return ReplayedImage(recorded.bag_time, stamp, outcome, prior)
 
-    def _localize(self, recorded: Recorded, stamp: int | None) -> Answer:
+    def _localize(self, recorded: Recorded) -> tuple[Outcome, np.ndarray | None]:
+        """Return what came of an image, and the prior (4, 4) it was tried with."""
         try:
-            query = self._inputs.query(_content(recorded))
+            query = self._inputs.for_image(recorded.message)
         except ValueError as error:
-            return Answer(recorded.bag_time, stamp, "refused", str(error))
+            return Outcome.refused(error), None
         prior = query.T_map_camera_prior
-        estimate = self._localizer.localize(query.image, query.camera, prior, query.prior_covariance)
-        # The pictures of thousands of images would fill the memory.
-        estimate = replace(estimate, correspondences=None, last_render=None)
-        return Answer(recorded.bag_time, stamp, estimate.status.value, estimate.reason, prior, estimate)
-
-
-def _content(recorded: Recorded) -> Any:
-    if recorded.message is None:
-        raise ValueError(recorded.problem)
-    return recorded.message
+        return Outcome.of(self._localizer.localize(query.image, query.camera, prior, query.prior_covariance)), prior
 
 
 def _no_tf(target: str, source: str, stamp: int) -> np.ndarray:

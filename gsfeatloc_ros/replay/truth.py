@@ -9,7 +9,7 @@ import numpy as np
 
 from gsfeatloc_ros.common.geometry import interpolate
 
-# Between poses farther apart than this many seconds the truth is not known.
+# Seconds. Between poses farther apart than this the truth is not known.
 MAX_GAP = 0.25
 
 
@@ -34,7 +34,7 @@ class Trajectory:
         return np.array([pose[:3, 3] for pose in self._poses]).reshape(-1, 3)
 
     def at(self, stamp: int) -> np.ndarray | None:
-        """The pose (4, 4) at a stamp in nanoseconds.
+        """Return the pose (4, 4) at a stamp in nanoseconds.
 
         Between two poses the translation is interpolated linearly and the rotation along the shortest way (slerp). None
         outside the trajectory, and between two poses that are more than MAX_GAP apart.

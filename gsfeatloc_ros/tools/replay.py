@@ -1,4 +1,4 @@
-"""Localizes the images of a recorded bag, without a ROS graph, as the node would.
+"""Localize the images of a recorded bag, without a ROS graph, as the node would.
 
     python -m gsfeatloc_ros.tools.replay BAG --map room.ply --image /camera/image_raw \\
         --camera-info /camera/camera_info --prior /prior --truth /ground_truth --out replayed
@@ -23,23 +23,24 @@ from statistics import median
 
 from tqdm import tqdm
 
-from gsfeatloc_ros.common.geometry import matrix_from_quaternion
+from gsfeatloc_ros.common.parameter import settings_from
 from gsfeatloc_ros.evaluate.extras import import_extra
-from gsfeatloc_ros.localize.localizer import Localizer, LocalizerOptions
-from gsfeatloc_ros.maps import Similarity, read_dataparser_transforms
-from gsfeatloc_ros.match import DEFAULT_MATCHER, MATCHERS, create_matcher
-from gsfeatloc_ros.render import create_renderer
-from gsfeatloc_ros.render.cache import load_prepared
-from gsfeatloc_ros.replay.bag import Bag, BagError, open_bag
+from gsfeatloc_ros.localize.engine import Engine, load_matcher, load_renderer
+from gsfeatloc_ros.localize.localizer import Localizer
+from gsfeatloc_ros.localize.options import LocalizerOptions
+from gsfeatloc_ros.localize.settings import MapSettings, MatcherSettings, RendererSettings
+from gsfeatloc_ros.match import MATCHERS
+from gsfeatloc_ros.replay.bag import Bag, BagError, Role, open_bag
 from gsfeatloc_ros.replay.figure import write_figure
 from gsfeatloc_ros.replay.output import errors, write_bag, write_csv, write_tum
-from gsfeatloc_ros.replay.run import Answer, Replay
+from gsfeatloc_ros.replay.run import Replay, ReplayedImage
 from gsfeatloc_ros.replay.truth import Trajectory
-from gsfeatloc_ros.ros_io.inputs import PriorPolicy
+from gsfeatloc_ros.ros_io.outcome import OutcomeStatus
+from gsfeatloc_ros.ros_io.prior import PriorPolicy
 from gsfeatloc_ros.tools.options import Settings, localizer_options, number, setting
 
-# Reasons in the summary, of which there may be as many as images.
-_MOST_REASONS = 5
+# Reasons of a kind in the summary, of which there may be as many as images.
+_MAX_REASONS = 5
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -62,84 +63,89 @@ def main(arguments: list[str] | None = None) -> int:
 def _replay(options: argparse.Namespace) -> int:
     if options.out.exists() and (not options.out.is_dir() or any(options.out.iterdir())):
         raise ValueError(f"{options.out}: is there already: name a new or an empty folder")
-    topics = {"image": options.image, "camera_info": options.camera_info, "prior": options.prior}
+    topics = {Role.IMAGE: options.image, Role.CAMERA_INFO: options.camera_info, Role.PRIOR: options.prior}
     if options.truth:
-        topics["truth"] = options.truth
+        topics[Role.TRUTH] = options.truth
         import_extra("matplotlib")  # to say now, not after an hour, that it is missing
     policy = PriorPolicy(map_frame=options.map_frame, max_age=options.prior_max_age)
     with open_bag(options.bag, topics) as bag:
         replay = Replay(bag, _localizer(options), policy, options.rectified)
         options.out.mkdir(parents=True, exist_ok=True)
         start = time.monotonic()
-        answers, status = _collect(replay, bag.images)
+        images, status = _collect(replay, bag.images)
         seconds = time.monotonic() - start
     truth = Trajectory(replay.truth) if options.truth else None
-    write_tum(options.out / "answers.tum", answers)
-    write_csv(options.out / "answers.csv", answers, truth)
-    write_bag(options.out / "answers", bag.storage, answers, options.map_frame)
+    write_tum(options.out / "answers.tum", images)
+    write_csv(options.out / "answers.csv", images, truth)
+    write_bag(options.out / "answers", bag.storage, images, options.map_frame)
     if truth is not None:
-        write_figure(options.out / "errors.png", answers, truth, options.map_frame)
-    print(_summary(bag, replay, answers, truth, seconds))
+        write_figure(options.out / "errors.png", images, truth, options.map_frame)
+    print(_summary(bag, replay, images, truth, seconds))
     print(f"wrote {options.out}")
     return status
 
 
-def _collect(replay: Replay, images: int) -> tuple[list[Answer], int]:
-    """All answers and 0, or those up to where it ended too early and the exit status for that."""
-    answers, localized = [], 0
+def _collect(replay: Replay, count: int) -> tuple[list[ReplayedImage], int]:
+    """Return all images and 0, or those up to where it ended too early and the exit status for that."""
+    images: list[ReplayedImage] = []
+    localized = 0
     try:
-        with tqdm(replay.answers(), total=images, unit="image") as progress:
-            for answer in progress:
-                answers.append(answer)
-                localized += answer.localized
+        with tqdm(replay.images(), total=count, unit="image") as progress:
+            for image in progress:
+                images.append(image)
+                localized += image.outcome.localized
                 progress.set_postfix_str(f"{localized} localized", refresh=False)
     except BagError as error:
         print(f"replay: {error}", file=sys.stderr)
-        return answers, 1
+        return images, 1
     except KeyboardInterrupt:
         print("replay: interrupted", file=sys.stderr)
-        return answers, 130
-    return answers, 0
+        return images, 130
+    return images, 0
 
 
 def _localizer(options: argparse.Namespace) -> Localizer:
-    gaussian_map = load_prepared(options.map, _alignment(options))
-    matcher = create_matcher(options.matcher, options.weights)
-    settings = LocalizerOptions(max_image_width=options.max_width, seed=options.seed, **options.set)
-    return Localizer(create_renderer(gaussian_map), matcher, settings)
+    map_ = MapSettings(
+        path=str(options.map),
+        frame_id=options.map_frame,
+        scale=options.map_scale,
+        translation=tuple(options.map_translation),
+        rotation=tuple(options.map_rotation),
+        dataparser_transforms=options.dataparser_transforms,
+    )
+    renderer = load_renderer(map_, RendererSettings())
+    matcher = load_matcher(MatcherSettings(options.matcher, options.weights), renderer.device)
+    values = {"max_image_width": options.max_width, "seed": options.seed, **options.set}
+    return Engine(map_.path, renderer, matcher, settings_from(LocalizerOptions, values)).localizer
 
 
-def _alignment(options: argparse.Namespace) -> Similarity:
-    rotation = matrix_from_quaternion(options.map_rotation)
-    alignment = Similarity(options.map_scale, rotation, options.map_translation)
-    if options.dataparser_transforms is None:
-        return alignment
-    return alignment @ read_dataparser_transforms(options.dataparser_transforms)
-
-
-def _summary(bag: Bag, replay: Replay, answers: Sequence[Answer], truth: Trajectory | None, seconds: float) -> str:
-    """What came out, for the terminal."""
-    counts = Counter(answer.status for answer in answers)
-    lines = [f"localized {counts['localized']} of {len(answers)} images"]
-    if len(answers) < bag.images:
+def _summary(
+    bag: Bag, replay: Replay, images: Sequence[ReplayedImage], truth: Trajectory | None, seconds: float
+) -> str:
+    """Return what came out, for the terminal."""
+    outcomes = [image.outcome for image in images]
+    counts = Counter(outcome.status for outcome in outcomes)
+    localized = counts.pop(OutcomeStatus.LOCALIZED, 0)
+    lines = [f"localized {localized} of {len(images)} images"]
+    if len(images) < bag.images:
         lines[0] += f"; the bag has {bag.images}"
     elif bag.seconds:
         lines[0] += f"; {bag.seconds:.1f} s of recording in {seconds:.1f} s"
-    times = [answer.estimate.milliseconds["total"] for answer in answers if answer.estimate]
+    times = [outcome.estimate.milliseconds["total"] for outcome in outcomes if outcome.estimate is not None]
     if times:
         lines.append(f"  median {median(times):.0f} ms an image")
-    for status in sorted(counts.keys() - {"localized"}):
-        lines.append(f"  {counts[status]} {status}:")
-        lines += _reasons(Counter(answer.reason for answer in answers if answer.status == status))
-    for role in sorted({role for role, _ in replay.unusable}):
-        lines.append(f"  {role} messages that cannot be used:")
-        lines += _reasons(Counter({why: count for (of, why), count in replay.unusable.items() if of == role}))
+    for status in sorted(counts, key=lambda status: status.value):
+        lines.append(f"  {counts[status]} {status.value}:")
+        lines += _reasons(Counter(outcome.reason for outcome in outcomes if outcome.status is status))
+    for role in sorted({role for role, _ in replay.unusable}, key=lambda role: role.value):
+        lines.append(f"  {role.value} messages that cannot be used:")
+        lines += _reasons(Counter({why: count for (of, why), count in replay.unusable.items() if of is role}))
     if truth is not None:
-        known = [errors(answer, truth) for answer in answers if answer.localized]
-        known = [(e["rotation_error_deg"], e["translation_error"]) for e in known if e]
-        lines.append(f"  truth known for {len(known)} of the {counts['localized']} answers")
-        if known:
-            rotation, translation = zip(*known, strict=True)
+        known = [errors(image, truth) for image in images if image.pose is not None]
+        pairs = [(e["rotation_error_deg"], e["translation_error"]) for e in known if e]
+        lines.append(f"  truth known for {len(pairs)} of the {localized} answers")
+        if pairs:
+            rotation, translation = zip(*pairs, strict=True)
             lines[-1] += (
                 f": median error {median(rotation):.3f} degrees, {median(translation):.4f} map units; largest "
                 f"{max(rotation):.3f} degrees, {max(translation):.4f}"
@@ -148,14 +154,15 @@ def _summary(bag: Bag, replay: Replay, answers: Sequence[Answer], truth: Traject
 
 
 def _reasons(counts: Counter[str]) -> list[str]:
-    lines = [f"    {count} x {reason}" for reason, count in counts.most_common(_MOST_REASONS)]
-    return lines + (["    ..."] if len(counts) > _MOST_REASONS else [])
+    lines = [f"    {count} x {reason}" for reason, count in counts.most_common(_MAX_REASONS)]
+    return lines + (["    ..."] if len(counts) > _MAX_REASONS else [])
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="replay", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
+    map_, matcher, localizer = MapSettings(), MatcherSettings(), LocalizerOptions()
     parser.add_argument("bag", type=Path, help="folder of a rosbag2, or an .mcap or .db3 file")
     parser.add_argument("--map", type=Path, required=True, help="the Gaussian Splatting map")
     topic = {"metavar": "TOPIC", "required": True}
@@ -170,17 +177,20 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--prior-max-age",
         type=number(float, 0),
-        default=PriorPolicy.max_age,
+        default=PriorPolicy().max_age,
         metavar="SECONDS",
         help="by which a prior may be older or newer than an image; 0 for no limit (default: %(default)s)",
     )
     parser.add_argument("--rectified", action="store_true", help="the images are rectified, as image.rectified")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new or empty folder")
-    parser.add_argument("--matcher", choices=sorted(MATCHERS), default=DEFAULT_MATCHER, help="default: %(default)s")
+    parser.add_argument("--matcher", choices=sorted(MATCHERS), default=matcher.name, help="default: %(default)s")
     parser.add_argument("--weights", default="", metavar="PATH", help="of a learned matcher, as matcher.weights")
-    parser.add_argument("--seed", type=number(int, 0), default=0, help="of RANSAC and of the search")
+    parser.add_argument("--seed", type=number(int, 0), default=localizer.seed, help="of RANSAC and of the search")
     parser.add_argument(
-        "--max-width", type=number(int, 1), default=640, help="resize wider images (default: %(default)s)"
+        "--max-width",
+        type=number(int, 1),
+        default=localizer.max_image_width,
+        help="resize wider images (default: %(default)s)",
     )
     parser.add_argument(
         "--set",
@@ -192,11 +202,11 @@ def _parser() -> argparse.ArgumentParser:
     )
     finite = number(float, -math.inf)
     frame = parser.add_argument_group("the map's frame", "as the node's parameters map.*")
-    frame.add_argument("--map-frame", default="map", metavar="NAME", help="default: %(default)s")
-    frame.add_argument("--map-scale", type=finite, default=1.0, metavar="S", help="default: %(default)s")
-    frame.add_argument("--map-translation", type=finite, nargs=3, default=[0.0] * 3, metavar=("X", "Y", "Z"))
-    frame.add_argument("--map-rotation", type=finite, nargs=4, default=[0.0] * 3 + [1.0], metavar=("X", "Y", "Z", "W"))
-    frame.add_argument("--dataparser-transforms", type=Path, metavar="FILE", help="nerfstudio's")
+    frame.add_argument("--map-frame", default=map_.frame_id, metavar="NAME", help="default: %(default)s")
+    frame.add_argument("--map-scale", type=finite, default=map_.scale, metavar="S", help="default: %(default)s")
+    frame.add_argument("--map-translation", type=finite, nargs=3, default=map_.translation, metavar=("X", "Y", "Z"))
+    frame.add_argument("--map-rotation", type=finite, nargs=4, default=map_.rotation, metavar=("X", "Y", "Z", "W"))
+    frame.add_argument("--dataparser-transforms", default="", metavar="FILE", help="nerfstudio's")
     return parser
 
 

@@ -19,15 +19,17 @@ from rosbags.typesys import Stores, get_typestore
 
 from gsfeatloc_ros.client.bag_player import Topics, play_bag
 from gsfeatloc_ros.common.geometry import make_pose, quaternion_from_matrix, so3_exp
-from gsfeatloc_ros.localize.localizer import Localizer, LocalizerOptions
+from gsfeatloc_ros.localize.localizer import Localizer
+from gsfeatloc_ros.localize.options import LocalizerOptions
 from gsfeatloc_ros.maps import load_map
 from gsfeatloc_ros.match import create_matcher
 from gsfeatloc_ros.render import create_renderer
-from gsfeatloc_ros.replay.bag import open_bag
+from gsfeatloc_ros.replay.bag import Role, open_bag
 from gsfeatloc_ros.replay.run import Replay
 from gsfeatloc_ros.replay.truth import MAX_GAP, Trajectory
 from gsfeatloc_ros.ros_io.decode import decode_compressed_image, decode_covariance
-from gsfeatloc_ros.ros_io.inputs import PriorPolicy
+from gsfeatloc_ros.ros_io.outcome import OutcomeStatus
+from gsfeatloc_ros.ros_io.prior import PriorPolicy
 from gsfeatloc_ros.simulate import write_bag
 from gsfeatloc_ros.tools.demo import running_localizer
 from gsfeatloc_ros.tools.replay import main
@@ -316,9 +318,9 @@ def test_images_are_paired_with_the_newest(localizer, small_camera, tmp_path_fac
         TOPICS["prior"]: "geometry_msgs/msg/PoseStamped",
     }
     bag = write(tmp_path_factory.mktemp("bag") / "bag", messages, storage, kinds)
-    with open_bag(bag, TOPICS) as opened:
+    with open_bag(bag, {Role(role): topic for role, topic in TOPICS.items()}) as opened:
         replay = Replay(opened, localizer, PriorPolicy())
-        answers = iter(list(replay.answers()))
+        replayed = iter(list(replay.images()))
     info = prior = None
     unusable = 0
     for number, event in enumerate(events):
@@ -328,16 +330,17 @@ def test_images_are_paired_with_the_newest(localizer, small_camera, tmp_path_fac
         elif "prior" in event:
             prior = number if event == "prior" else None
         else:
-            answer = next(answers)
-            assert answer.stamp == (None if event == "corrupt image" else 10**9 * (5 + number))
+            image = next(replayed)
+            assert image.stamp == (None if event == "corrupt image" else 10**9 * (5 + number))
             if event == "image" and info and prior is not None:
-                assert answer.status == "failed"
-                assert answer.reason.startswith("0 features")
-                assert answer.T_map_camera_prior[0, 3] == prior
+                assert image.outcome.status is OutcomeStatus.FAILED
+                assert image.outcome.reason.startswith("0 features")
+                assert image.T_map_camera_prior[0, 3] == prior
             else:
-                assert answer.status == "refused"
-                assert answer.reason
-    assert next(answers, None) is None
+                assert image.outcome.status is OutcomeStatus.REFUSED
+                assert image.outcome.reason
+            assert image.pose is None
+    assert next(replayed, None) is None
     assert sum(replay.unusable.values()) == unusable
 
 
