@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import importlib
 import tempfile
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +16,7 @@ from gsfeatloc_ros.common.stage_clock import StageClock
 from gsfeatloc_ros.evaluate.scene import load_scene
 from gsfeatloc_ros.localize.first_run import warm_up
 from gsfeatloc_ros.maps import GaussianMap, load_map
-from gsfeatloc_ros.render import Render, Renderer, create_renderer
+from gsfeatloc_ros.render import DrawOptions, Render, SplatRenderer, create_renderer
 from gsfeatloc_ros.render.cache import load_prepared
 
 Size = tuple[int, int]
@@ -28,14 +26,6 @@ _FIELD_OF_VIEW = 65.0  # degrees, horizontal
 _OUTSIDE = 0.05
 # The first frames grow the renderer's buffers.
 UNCOUNTED = 2
-# The renderers' steps by the functions that do them, and the modules where they are looked up.
-_STAGES_ON_CPU = {"visible_chunks": "cull", "project": "project", "gather": "scatter", "blend": "sort and blend"}
-_STAGES_ON_GPU = {
-    "fully_fused_projection": "project",
-    "spherical_harmonics": "colour",
-    "isect_tiles": "tiles and sort",
-    "rasterize_to_pixels": "blend",
-}
 
 
 def measure_map(
@@ -74,7 +64,7 @@ def measure_map(
     return report | {"load": {"cold": cold, "from_cache": cached}}
 
 
-def _measure_load(load: Callable[[], Renderer]) -> tuple[Renderer, dict[str, float]]:
+def _measure_load(load: Callable[[], SplatRenderer]) -> tuple[SplatRenderer, dict[str, float]]:
     """Load a map, with the seconds and megabytes that it takes."""
     with memory_taken() as memory:
         loaded = timed(load)
@@ -95,13 +85,13 @@ def measure_scene(path: Path, size: Size, device: str, threads: int) -> dict[str
     """
     scene = load_scene(path)
     gaussian_map = load_map(scene.map_path)
-    renderer = create_renderer(gaussian_map, device, threads, scene.background)
+    renderer = create_renderer(gaussian_map, device, threads, DrawOptions(scene.background))
     poses = [photo.T_map_camera for photo in scene.photos]
     report = {"map": scene.name, "gaussians": len(gaussian_map), "sh_degree": gaussian_map.sh_degree}
     return report | measure_frames(renderer, scene.camera.scaled(*size), poses)
 
 
-def measure_frames(renderer: Renderer, camera: Camera, poses: list[np.ndarray]) -> dict[str, Any]:
+def measure_frames(renderer: SplatRenderer, camera: Camera, poses: list[np.ndarray]) -> dict[str, Any]:
     """Milliseconds of frames at `poses`, (4, 4) each, also by stage (mean), and how much of the last one is covered."""
 
     def draw(pose: np.ndarray) -> Render:
@@ -114,9 +104,9 @@ def measure_frames(renderer: Renderer, camera: Camera, poses: list[np.ndarray]) 
     frames = [timed(draw, pose) for pose in poses]
     # Apart from the others, whose time this is not to cost.
     time_of_stages, now = stage_time(renderer.device)
-    with _stages_of_frames(renderer.device, now) as clock:
-        for pose in poses:
-            draw(pose)
+    clock = StageClock(now)
+    for pose in poses:
+        renderer.render(camera, pose, clock.stage)
     stages = {name: ms / len(poses) for name, ms in clock.milliseconds().items() if name != "total"}
     return {
         "size": [camera.width, camera.height],
@@ -159,27 +149,3 @@ def view_of_all(gaussian_map: GaussianMap) -> np.ndarray:
     distance = np.max(high - low) / np.tan(np.radians(0.5 * _FIELD_OF_VIEW))
     position = 0.5 * (low + high) - [0, 0, distance]
     return gaussian_map.S_map_splat.transform_pose(make_pose(np.eye(3), position))
-
-
-@contextmanager
-def _stages_of_frames(device: str, now: Callable[[], float]) -> Iterator[StageClock]:
-    """While this is open, renderers on the device count the time of their steps on the clock that it gives."""
-    clock = StageClock(now)
-    stages = _STAGES_ON_CPU if device == "cpu" else _STAGES_ON_GPU
-    module = importlib.import_module("gsfeatloc_ros.render.cpu" if device == "cpu" else "gsplat")
-
-    def counted(function: Callable, stage: str) -> Callable:
-        def call(*arguments: object, **options: object) -> object:
-            with clock.stage(stage):
-                return function(*arguments, **options)
-
-        return call
-
-    functions = {name: getattr(module, name) for name in stages}
-    try:
-        for name, function in functions.items():
-            setattr(module, name, counted(function, stages[name]))
-        yield clock
-    finally:
-        for name, function in functions.items():
-            setattr(module, name, function)

@@ -18,7 +18,7 @@ from gsfeatloc_ros.localize import localizer as localize
 from gsfeatloc_ros.localize.localizer import Localizer
 from gsfeatloc_ros.maps import load_map
 from gsfeatloc_ros.match import create_matcher
-from gsfeatloc_ros.render import create_renderer
+from gsfeatloc_ros.render import DrawOptions, create_renderer
 
 
 def measure_queries(scene_path: Path, matcher_name: str, sigma: float, device: str, threads: int) -> dict[str, Any]:
@@ -32,7 +32,7 @@ def measure_queries(scene_path: Path, matcher_name: str, sigma: float, device: s
         ValueError, OSError, RuntimeError: the scene, the matcher or the device cannot be used.
     """
     scene = load_scene(scene_path)
-    renderer = create_renderer(load_map(scene.map_path), device, threads, scene.background)
+    renderer = create_renderer(load_map(scene.map_path), device, threads, DrawOptions(scene.background))
     localizer = Localizer(renderer, create_matcher(matcher_name, device=device))
     error = paper_prior_error(scene, sigma)
     queries = [

@@ -1,4 +1,4 @@
-"""Pictures and features lie on the host, as numpy's arrays, or on a GPU, as tensors of torch's."""
+"""Pictures and features lie on the host, as numpy's arrays, or on a GPU, as torch's tensors."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ Array: TypeAlias = Union[np.ndarray, "torch.Tensor"]
 
 
 def to_host(array: Array) -> np.ndarray:
-    """The same as an array of numpy's; a tensor is copied from its device."""
+    """Return the same as a numpy array; a tensor is copied from its device."""
     return array if isinstance(array, np.ndarray) else array.cpu().numpy()
 
 
 def to_device(array: Array, device: str | torch.device) -> torch.Tensor:
-    """The same as a tensor on a device of torch's.
+    """Return the same as a tensor on a device of torch's.
 
     The host does not wait until it is there; the array may change as soon as this returns.
     """

@@ -1,4 +1,7 @@
-"""On what to render and match; without gsplat a GPU is of no use, and torch is not loaded to find that out."""
+"""The device to render, match and track on.
+
+Without gsplat a GPU is of no use, and torch is not loaded to find that out.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,7 @@ _log = logging.getLogger(__name__)
 
 @functools.cache
 def gpu_problem() -> str:
-    """Why GpuRenderer cannot be used on this machine and what to do about it; empty where it can."""
+    """Return why gsplat and torch cannot use a GPU of this machine, and what to do about it; "" where they can."""
     if importlib.util.find_spec("gsplat") is None:
         return "gsplat is not installed: pip install 'gsplat>=1.5.3,<1.6'; it needs torch for CUDA and the CUDA toolkit"
     import torch  # takes over a second, which a machine without gsplat is spared
@@ -22,30 +25,41 @@ def gpu_problem() -> str:
         return f"torch {torch.__version__} is a build without CUDA: install one with it, see https://pytorch.org"
     if not torch.cuda.is_available():
         return f"torch {torch.__version__} finds no CUDA device: see whether nvidia-smi lists one"
-    from gsfeatloc_ros.render.gpu import self_check
-
-    return self_check("cuda")
+    return ""
 
 
-def chosen_device(device: str) -> str:
-    """The device that a name of DEVICES stands for here: "cpu" or "cuda".
+def choose_device(name: str) -> str:
+    """Return the device, "cpu" or "cuda", that one of DEVICES stands for on this machine.
+
+    "auto" is the GPU where gsplat and torch can use one; otherwise it is the CPU, and the log says why.
 
     Raises:
         ValueError: an unknown name.
         RuntimeError: "cuda" cannot be used; the message says what is missing and what to do.
     """
-    if device not in DEVICES:
-        raise ValueError(f"renderer device {device!r} is not one of {', '.join(DEVICES)}")
-    problem = "" if device == "cpu" else gpu_problem()
-    if device == "cuda" and problem:
-        raise RuntimeError(f"renderer device cuda: {problem}")
-    if problem:
-        explain_fallback(problem)
-    return "cpu" if device == "cpu" or problem else "cuda"
+    if name not in DEVICES:
+        raise ValueError(f"device {name!r} is not one of {', '.join(DEVICES)}")
+    if name == "cpu":
+        return "cpu"
+    return device_without(gpu_problem(), name)
+
+
+def device_without(problem: str, name: str) -> str:
+    """Return the device that "auto" or "cuda" stands for in view of a problem of the GPU; "" for none.
+
+    Raises:
+        RuntimeError: there is a problem, and the name is "cuda".
+    """
+    if not problem:
+        return "cuda"
+    if name == "cuda":
+        raise RuntimeError(f"device cuda: {problem}")
+    explain_fallback(problem)
+    return "cpu"
 
 
 @functools.cache
 def explain_fallback(problem: str) -> None:
-    """Say once that rendering is on the CPU, as a warning where a GPU was meant to be used."""
+    """Log once that the CPU is used, as a warning where a GPU was meant to be."""
     level = logging.WARNING if importlib.util.find_spec("gsplat") else logging.INFO
     _log.log(level, "rendering on the CPU: %s", problem)

@@ -1,4 +1,4 @@
-"""Where numba keeps compiled kernels. This is read before numba is imported, and imports nothing of it."""
+"""Where numba keeps compiled kernels (render/kernels.py). This imports nothing of numba."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ def set_kernel_cache() -> None:
 
     numba looks whether the file that a kernel stands in has changed, not whether what it imports has. The folder is
     below NUMBA_CACHE_DIR where that is set; otherwise beside the sources, or where that cannot be written to, below
-    $XDG_CACHE_HOME/gsfeatloc_ros/numba or ~/.cache/gsfeatloc_ros/numba.
+    $XDG_CACHE_HOME/gsfeatloc_ros/numba or ~/.cache/gsfeatloc_ros/numba. NUMBA_CACHE_DIR is it from then on, also in
+    the processes that this one starts.
     """
     name = f"kernels-{hash_of_sources('render')[:16]}"
     root = os.environ.get("NUMBA_CACHE_DIR") or next(
@@ -30,12 +31,15 @@ def set_kernel_cache() -> None:
 
 
 def kernel_cache_folder() -> Path:
-    """Where numba keeps compiled kernels, once set_kernel_cache was called."""
+    """Return where numba keeps compiled kernels, once set_kernel_cache was called."""
     return Path(os.environ["NUMBA_CACHE_DIR"])
 
 
 def hash_of_sources(*folders: str) -> str:
-    """SHA-256 of the sources in some of the package's folders: the version of what they make and keep in files."""
+    """Return the SHA-256 of the sources in some of the package's folders.
+
+    It is the version of what they make and keep in files.
+    """
     digest = hashlib.sha256()
     for folder in folders:
         for source in sorted((_PACKAGE / folder).glob("*.py")):
@@ -44,14 +48,17 @@ def hash_of_sources(*folders: str) -> str:
 
 
 def user_cache_folder() -> Path:
-    """This package's folder under $XDG_CACHE_HOME or ~/.cache; it need not exist."""
+    """Return this package's folder under $XDG_CACHE_HOME or ~/.cache; it need not exist."""
     root = os.environ.get("XDG_CACHE_HOME", "")
     # By the specification a relative one is to be ignored.
     return (Path(root) if os.path.isabs(root) else Path(os.path.expanduser("~"), ".cache")) / "gsfeatloc_ros"
 
 
 def can_write(folder: Path) -> bool:
-    """Whether files can be made in `folder`, which is made itself if need be: what permissions say is not enough."""
+    """Return whether files can be made in `folder`, which is made itself if need be.
+
+    One is made: what permissions say is not enough.
+    """
     try:
         folder.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=folder).close()

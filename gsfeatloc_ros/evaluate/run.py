@@ -23,7 +23,7 @@ from gsfeatloc_ros.localize.estimate import Estimate
 from gsfeatloc_ros.localize.localizer import Localizer, LocalizerOptions
 from gsfeatloc_ros.maps import load_map
 from gsfeatloc_ros.match import Matcher, create_matcher
-from gsfeatloc_ros.render import Renderer, create_renderer
+from gsfeatloc_ros.render import DrawOptions, Renderer, create_renderer
 
 METHODS = ("default", "published")
 PRIORS_FILE = "priors-file"
@@ -172,7 +172,7 @@ def open_scene(folder: Path, map_path: Path | None, version: str) -> Scene:
 @lru_cache(maxsize=1)
 def open_renderer(map_path: Path, background: tuple[float, float, float], version: str, threads: int = 0) -> Renderer:
     """The renderer of a map."""
-    return create_renderer(load_map(map_path), threads=threads, background=background)
+    return create_renderer(load_map(map_path), threads=threads, options=DrawOptions(background))
 
 
 @lru_cache(maxsize=1)

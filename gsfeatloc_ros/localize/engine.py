@@ -11,7 +11,7 @@ from gsfeatloc_ros.localize.options import LocalizerOptions
 from gsfeatloc_ros.localize.settings import MapSettings, MatcherSettings, RendererSettings
 from gsfeatloc_ros.maps import load_map
 from gsfeatloc_ros.match import Matcher, create_matcher
-from gsfeatloc_ros.render import Renderer, create_renderer
+from gsfeatloc_ros.render import DrawOptions, Renderer, create_renderer
 from gsfeatloc_ros.render.cache import load_prepared
 
 
@@ -65,9 +65,7 @@ def load_renderer(
         load(map_.path, map_.alignment()),
         renderer.device,
         renderer.threads,
-        background=background,
-        sh_degree=renderer.sh_degree,
-        resolution_scale=renderer.resolution_scale,
+        DrawOptions(background, renderer.sh_degree, renderer.resolution_scale),
     )
 
 

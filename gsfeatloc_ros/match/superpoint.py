@@ -7,7 +7,6 @@ when Hugging Face or LightGlue pass them on.
 
 from __future__ import annotations
 
-import logging
 from pathlib import Path
 
 import torch
@@ -19,8 +18,6 @@ from gsfeatloc_ros.match.lightglue import PlacedFeatures
 from gsfeatloc_ros.match.peaks import cell_heatmap, centroid
 from gsfeatloc_ros.match.tensor import to_matches, to_tensor
 from gsfeatloc_ros.match.weights import WeightsError
-
-_log = logging.getLogger(__name__)
 
 # Matcher: its class in transformers, and the model on Hugging Face's hub.
 _MODELS = {
@@ -49,11 +46,6 @@ class SuperPointMatcher:
         class_name, hub_name = _MODELS[network]
         self._network = _load(class_name, str(Path(weights).expanduser()) if weights else hub_name).to(device)
         self._device = device
-        _log.warning(
-            "superpoint-%s: Magic Leap's weights of SuperPoint and SuperGlue are licensed for noncommercial research "
-            "by academic or non-profit organizations only",
-            network,
-        )
         self._superpoint = self._network.keypoint_detector
         self._superpoint.keypoint_decoder.max_keypoints = max_features
         self._takes_scores = network == "superglue"

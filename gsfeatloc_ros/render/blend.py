@@ -6,12 +6,13 @@ import math
 
 import numpy as np
 from llvmlite import ir
-from numba import njit, prange, types
-from numba.extending import intrinsic
+from numba import types
 
 from gsfeatloc_ros.render import base
+from gsfeatloc_ros.render.kernels import intrinsic, njit, prange
 from gsfeatloc_ros.render.lanes import (
     LANES,
+    broadcast,
     exp2,
     load,
     lowest_bit,
@@ -20,7 +21,6 @@ from gsfeatloc_ros.render.lanes import (
     minimum,
     prefetch,
     select,
-    spread,
     sqrt,
     store,
 )
@@ -41,11 +41,11 @@ from gsfeatloc_ros.render.project import (
 )
 
 # Lanes are blocks of 4 x 4 pixels: splats are round rather than long, and touch fewer of these than rows of 16.
-BLOCK = 4
-_BLOCKS_X = TILE // BLOCK
+BLOCK_SIZE = 4
+_BLOCKS_X = TILE // BLOCK_SIZE
 _BLOCKS = _BLOCKS_X * _BLOCKS_X
 # Splats copied beside each other at a time, and then sifted by block: a bit for each.
-_BATCH = 64
+_BATCH_SIZE = 64
 
 # State of a block's pixels. Depths count from the tile's nearest splat: the spread is a difference of squares.
 _TRANSMITTANCE, _COVERED, _RED, _GREEN, _BLUE, _MOMENT1, _MOMENT2, _MEDIAN = range(8)
@@ -58,13 +58,13 @@ _ZERO, _HALF, _ONE = _F(0), _F(0.5), _F(1)
 _LOG_MIN_ALPHA, _MAX_ALPHA = _F(math.log2(base.MIN_ALPHA)), _F(base.MAX_ALPHA)
 _MIN_TRANSMITTANCE, _DEPTH_MIN_ALPHA = (_F(base.MIN_TRANSMITTANCE), _F(base.DEPTH_MIN_ALPHA))
 # Less is as good as nothing, and CPUs are slow at numbers that are almost too small for float32.
-_TINY = _F(1e-30)
+_TRANSMITTANCE_FLOOR = _F(1e-30)
 _NAN = _F(np.nan)
-_COLUMNS = np.tile(np.arange(BLOCK, dtype=np.float32), BLOCK)
-_ROWS = np.repeat(np.arange(BLOCK, dtype=np.float32), BLOCK)
+_COLUMNS = np.tile(np.arange(BLOCK_SIZE, dtype=np.float32), BLOCK_SIZE)
+_ROWS = np.repeat(np.arange(BLOCK_SIZE, dtype=np.float32), BLOCK_SIZE)
 
 # A digit of the depth sort has at most so many bits.
-_DIGIT = 9
+_MAX_DIGIT_BITS = 9
 
 
 @njit(nogil=True, cache=True)
@@ -155,7 +155,7 @@ def _sorted_by_depth(keys, spare):
     bits = 0
     while (high - low) >> np.uint64(bits):
         bits += 1
-    digits = -(-bits // _DIGIT)
+    digits = -(-bits // _MAX_DIGIT_BITS)
     width = -(-bits // max(digits, 1))
     mask = np.uint64((1 << width) - 1)
     counts = np.empty(1 << width, dtype=np.int64)
@@ -183,14 +183,14 @@ def _blend_tile(splats, keys, x0, y0, nearest, state):
     """Blend splats, nearest first, into the state (_BLOCKS, _STATE) of a tile whose first pixel is x0, y0."""
     state[:] = _ZERO
     for block in range(_BLOCKS):
-        store(state, block * _STATE + _TRANSMITTANCE * LANES, spread(_ONE))
-    batch = np.empty(_BATCH * SPLAT_SIZE, dtype=np.float32)
+        store(state, block * _STATE + _TRANSMITTANCE * LANES, broadcast(_ONE))
+    batch = np.empty(_BATCH_SIZE * SPLAT_SIZE, dtype=np.float32)
     members = np.empty(_BLOCKS, dtype=np.uint64)
     running = np.ones(_BLOCKS, dtype=np.bool_)
-    for first in range(0, len(keys), _BATCH):
-        count = min(_BATCH, len(keys) - first)
+    for first in range(0, len(keys), _BATCH_SIZE):
+        count = min(_BATCH_SIZE, len(keys) - first)
         # The records of the batch after this one come from memory while this one is blended.
-        for key in keys[first + _BATCH : first + 2 * _BATCH]:
+        for key in keys[first + _BATCH_SIZE : first + 2 * _BATCH_SIZE]:
             prefetch(splats, _record(key))
         for k in range(count):
             store(batch, k * SPLAT_SIZE, load(splats, _record(keys[first + k])))
@@ -198,7 +198,7 @@ def _blend_tile(splats, keys, x0, y0, nearest, state):
         any_running = False
         for block in range(_BLOCKS):
             if running[block]:
-                x, y = x0 + _F(block % _BLOCKS_X * BLOCK), y0 + _F(block // _BLOCKS_X * BLOCK)
+                x, y = x0 + _F(block % _BLOCKS_X * BLOCK_SIZE), y0 + _F(block // _BLOCKS_X * BLOCK_SIZE)
                 running[block] = _blend_block(batch, members[block], x, y, nearest, state, block * _STATE)
                 any_running |= running[block]
         if not any_running:
@@ -211,23 +211,23 @@ def _find_members(batch, count, x0, y0, members):
 
     Without a branch on what each splat touches: that cannot be predicted.
     """
-    boxes = np.empty((4, _BATCH), dtype=np.float32)
-    for k in range(_BATCH):
+    boxes = np.empty((4, _BATCH_SIZE), dtype=np.float32)
+    for k in range(_BATCH_SIZE):
         at = _U(k) * _U(SPLAT_SIZE)
         for side in range(4):
             boxes[side, k] = batch[at + _U(LEFT + side)]
     boxes = boxes.reshape(-1)
     columns, rows = np.zeros(_BLOCKS_X, dtype=np.uint64), np.zeros(_BLOCKS_X, dtype=np.uint64)
-    for group in range(0, _BATCH, LANES):
-        left, right = load(boxes, group), load(boxes, _BATCH + group)
-        top, bottom = load(boxes, 2 * _BATCH + group), load(boxes, 3 * _BATCH + group)
+    for group in range(0, _BATCH_SIZE, LANES):
+        left, right = load(boxes, group), load(boxes, _BATCH_SIZE + group)
+        top, bottom = load(boxes, 2 * _BATCH_SIZE + group), load(boxes, 3 * _BATCH_SIZE + group)
         for i in range(_BLOCKS_X):
-            first, last = _F(i * BLOCK), _F(i * BLOCK + BLOCK - 1)
+            first, last = _F(i * BLOCK_SIZE), _F(i * BLOCK_SIZE + BLOCK_SIZE - 1)
             in_column = mask_bits((left <= x0 + last) & (right >= x0 + first))
             in_row = mask_bits((top <= y0 + last) & (bottom >= y0 + first))
             columns[i] |= _U(in_column) << _U(group)
             rows[i] |= _U(in_row) << _U(group)
-    among = _U(0xFFFFFFFFFFFFFFFF) >> _U(_BATCH - count)
+    among = _U(0xFFFFFFFFFFFFFFFF) >> _U(_BATCH_SIZE - count)
     for block in range(_BLOCKS):
         members[block] = columns[block % _BLOCKS_X] & rows[block // _BLOCKS_X] & among
 
@@ -256,7 +256,7 @@ def _blend_block(batch, members, x0, y0, nearest, state, at):
         weight = select(after > _MIN_TRANSMITTANCE, transmittance * alpha, _ZERO)
         z = batch[k + _U(DEPTH)] - nearest
         median = select((transmittance > _HALF) & (after <= _HALF), z, median)
-        transmittance = maximum(after, _TINY)
+        transmittance = maximum(after, _TRANSMITTANCE_FLOOR)
         covered = covered + weight
         red = red + weight * batch[k + _U(RED)]
         green = green + weight * batch[k + _U(GREEN)]
@@ -293,10 +293,10 @@ def _finish_tile(state, x0, y0, nearest, background, rgb, depth, median_depth, d
         store(state, at + _MOMENT1 * LANES, select(has_depth, mean + nearest, _NAN))
         store(state, at + _MOMENT2 * LANES, select(has_depth, sqrt(maximum(variance, _ZERO)), _NAN))
         store(state, at + _MEDIAN * LANES, select(has_depth, median + nearest, _NAN))
-        left, top = x0 + block % _BLOCKS_X * BLOCK, y0 + block // _BLOCKS_X * BLOCK
-        for y in range(top, min(top + BLOCK, height)):
-            for x in range(left, min(left + BLOCK, width)):
-                pixel = at + (y - top) * BLOCK + x - left
+        left, top = x0 + block % _BLOCKS_X * BLOCK_SIZE, y0 + block // _BLOCKS_X * BLOCK_SIZE
+        for y in range(top, min(top + BLOCK_SIZE, height)):
+            for x in range(left, min(left + BLOCK_SIZE, width)):
+                pixel = at + (y - top) * BLOCK_SIZE + x - left
                 alpha[y, x] = state[pixel + _COVERED * LANES]
                 rgb[y, x, 0] = state[pixel + _RED * LANES]
                 rgb[y, x, 1] = state[pixel + _GREEN * LANES]

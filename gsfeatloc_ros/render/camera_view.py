@@ -5,16 +5,16 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.render.base import EPS2D, MIN_ALPHA, NEAR_PLANE
+from gsfeatloc_ros.render.kernels import njit
 
 # Pixels by which the blur can widen a Gaussian.
 _MAX_BLUR = np.sqrt(2 * np.log(1.0 / MIN_ALPHA) * EPS2D)
 
 
-class View(NamedTuple):
+class CameraView(NamedTuple):
     """A camera at a pose in the splat frame.
 
     Attributes:
@@ -41,29 +41,32 @@ class View(NamedTuple):
     height: int
 
 
-def view_of(camera: Camera, T_splat_camera: np.ndarray) -> View:
-    """The view of `camera` (its distortion ignored) from the pose `T_splat_camera` (4, 4)."""
+def camera_view(camera: Camera, T_splat_camera: np.ndarray) -> CameraView:
+    """Return the view of `camera` (its distortion ignored) from the pose `T_splat_camera` (4, 4)."""
     (fx, _, cx), (_, fy, cy) = camera.K[0], camera.K[1]
     # As in gsplat, 30 % outside the image; the image begins half a pixel before the centre of the first pixel.
     margin_x, margin_y = 0.3 * 0.5 * camera.width / fx, 0.3 * 0.5 * camera.height / fy
-    slopes = (
-        -(cx + 0.5) / fx - margin_x,
-        (camera.width - cx - 0.5) / fx + margin_x,
-        -(cy + 0.5) / fy - margin_y,
-        (camera.height - cy - 0.5) / fy + margin_y,
-    )
-    return View(
-        np.ascontiguousarray(T_splat_camera[:3, :3].T, dtype=np.float32),
-        np.array(T_splat_camera[:3, 3], dtype=np.float64),
-        np.array(T_splat_camera[:3, 2], dtype=np.float64),
-        *(np.float32(value) for value in (fx, fy, cx, cy, *slopes)),
-        camera.width,
-        camera.height,
+    return CameraView(
+        rotation=np.ascontiguousarray(T_splat_camera[:3, :3].T, dtype=np.float32),
+        origin=np.array(T_splat_camera[:3, 3], dtype=np.float64),
+        forward=np.array(T_splat_camera[:3, 2], dtype=np.float64),
+        fx=np.float32(fx),
+        fy=np.float32(fy),
+        cx=np.float32(cx),
+        cy=np.float32(cy),
+        left=np.float32(-(cx + 0.5) / fx - margin_x),
+        right=np.float32((camera.width - cx - 0.5) / fx + margin_x),
+        top=np.float32(-(cy + 0.5) / fy - margin_y),
+        bottom=np.float32((camera.height - cy - 0.5) / fy + margin_y),
+        width=camera.width,
+        height=camera.height,
     )
 
 
-def visible_chunks(view: View, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Indices (n,) int64, ascending, of the chunks with boxes `low` to `high` (C, 3) that `view` may see a part of.
+def visible_chunks(view: CameraView, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Return the indices (n,) int64, ascending, of the chunks that `view` may see a part of.
+
+    Their boxes are `low` to `high` (C, 3), splat frame.
 
     A Gaussian is drawn as wide as the linearised projection makes it, not as wide as it would be seen. One outside a
     side of the frustum is linearised at a slope up to a margin further out: it reaches further in than its box by at

@@ -10,11 +10,13 @@ import operator
 
 import numpy as np
 from llvmlite import ir
-from numba import njit, types
+from numba import types
 from numba.core import cgutils
 from numba.core.typing import signature
 from numba.core.typing.templates import AbstractTemplate, infer_global
-from numba.extending import intrinsic, lower_builtin, models, register_model
+from numba.extending import lower_builtin, models, register_model
+
+from gsfeatloc_ros.render.kernels import intrinsic, njit
 
 LANES = 16
 
@@ -55,7 +57,7 @@ class _MaskModel(models.PrimitiveModel):
         super().__init__(manager, fe_type, _BITS)
 
 
-def _spread(builder, number):
+def _broadcast(builder, number):
     """A vector with the same number in every lane."""
     undefined = ir.Constant(ir.VectorType(number.type, LANES), ir.Undefined)
     first = builder.insert_element(undefined, number, ir.Constant(ir.IntType(32), 0))
@@ -73,7 +75,7 @@ def _define_operator(function, result, emit) -> None:
             return None
 
     def lower(context, builder, sig, args):
-        vectors = (v if t is _LANES else _spread(builder, v) for v, t in zip(args, sig.args, strict=True))
+        vectors = (v if t is _LANES else _broadcast(builder, v) for v, t in zip(args, sig.args, strict=True))
         return emit(builder, *vectors)
 
     for operands in ((_LANES, _LANES), (_LANES, types.float32), (types.float32, _LANES)):
@@ -102,11 +104,11 @@ def _lower_and(context, builder, sig, args):
 
 
 @intrinsic
-def spread(typingctx, number):
+def broadcast(typingctx, number):
     """The same number in every lane."""
 
     def codegen(context, builder, sig, args):
-        return _spread(builder, args[0])
+        return _broadcast(builder, args[0])
 
     return _LANES(types.float32), codegen
 
@@ -173,8 +175,9 @@ def offsets(typingctx, points, origin, axis):
         along, differences = ir.Constant(_DOUBLES, [0.0] * LANES), []
         for i in range(3):
             values, start, slope = (builder.extract_value(arg, i) for arg in args)
-            difference = builder.fsub(builder.fpext(values, _DOUBLES), _spread(builder, start))
-            along = builder.fadd(along, builder.fmul(difference, _spread(builder, slope), flags=_FLAGS), flags=_FLAGS)
+            difference = builder.fsub(builder.fpext(values, _DOUBLES), _broadcast(builder, start))
+            product = builder.fmul(difference, _broadcast(builder, slope), flags=_FLAGS)
+            along = builder.fadd(along, product, flags=_FLAGS)
             differences.append(difference)
         rounded = (builder.fptrunc(values, _FLOATS) for values in (*differences, along))
         return context.make_tuple(builder, sig.return_type, rounded)
@@ -237,7 +240,7 @@ def select(typingctx, mask, a, b):
     """`a` in the lanes of the mask, `b` in the others; either may be a number."""
 
     def codegen(context, builder, sig, args):
-        a, b = (v if t is _LANES else _spread(builder, v) for v, t in zip(args[1:], sig.args[1:], strict=True))
+        a, b = (v if t is _LANES else _broadcast(builder, v) for v, t in zip(args[1:], sig.args[1:], strict=True))
         return builder.select(args[0], a, b)
 
     return _LANES(_MASK, *(t if t is _LANES else types.float32 for t in (a, b))), codegen

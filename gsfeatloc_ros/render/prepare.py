@@ -1,4 +1,4 @@
-"""What the CPU renderer makes of a map once, when it is loaded: Gaussians in the order and form that frames need."""
+"""What is made of a map once, when it is loaded: Gaussians in the order and form that the CPU renderer needs."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ import threading
 from dataclasses import dataclass, field
 
 import numpy as np
-from numba import njit, prange
 
-from gsfeatloc_ros.maps.gaussian_map import GaussianMap
+from gsfeatloc_ros.maps.gaussian_map import SH_COEFFICIENTS, GaussianMap
 from gsfeatloc_ros.maps.similarity import Similarity
 from gsfeatloc_ros.render.base import MIN_ALPHA
+from gsfeatloc_ros.render.kernels import njit, prange
 from gsfeatloc_ros.render.lanes import bits_of_float
 
 # Held while kernels run in parallel: numba's fallback threading layer does not take calls from two threads at once.
@@ -19,7 +19,7 @@ KERNEL_LOCK = threading.Lock()
 
 CHUNK = 256
 # Rows of a chunk: centre, covariance in the splat frame, log2 of the opacity.
-X, Y, Z, XX, XY, XZ, YY, YZ, ZZ, LOG_OPACITY = range(10)
+(MEAN_X, MEAN_Y, MEAN_Z, COV_XX, COV_XY, COV_XZ, COV_YY, COV_YZ, COV_ZZ, LOG2_OPACITY) = range(10)
 ROWS = 10
 
 _MIN_HALF, _MAX_HALF = np.float32(2.0**-14), np.float32(65504)
@@ -49,9 +49,45 @@ class PreparedMap:
     antialiased: bool = False
     S_map_splat: Similarity = field(default_factory=Similarity)
 
+    @property
+    def sh_coefficients(self) -> int:
+        """Number of spherical harmonics per colour channel that are stored."""
+        return self.sh.shape[1] // 3
+
+    def unpacked(self, sh_degree: int) -> UnpackedGaussians:
+        """Return the Gaussians one by one, in their order, with harmonics up to a degree or as many as there are."""
+        used = min(self.sh_coefficients, SH_COEFFICIENTS[sh_degree])
+        rows = self.gaussians.transpose(0, 2, 1).reshape(-1, ROWS)
+        # Those that fill up the last chunk have no opacity.
+        count = np.count_nonzero(np.isfinite(rows[:, LOG2_OPACITY]))
+        sh = self.sh[:, : 3 * used].transpose(0, 2, 1).reshape(-1, used, 3)
+        return UnpackedGaussians(
+            means=np.ascontiguousarray(rows[:count, MEAN_X : MEAN_Z + 1]),
+            covariances=np.ascontiguousarray(rows[:count, COV_XX : COV_ZZ + 1]),
+            opacities=np.exp2(rows[:count, LOG2_OPACITY]),
+            sh=sh[:count],
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class UnpackedGaussians:
+    """The Gaussians of a prepared map one by one.
+
+    Attributes:
+        means: (N, 3) float32, splat frame.
+        covariances: (N, 6) float32, splat frame: xx, xy, xz, yy, yz, zz.
+        opacities: (N,) float32.
+        sh: (N, C, 3) float16, harmonics of the colour.
+    """
+
+    means: np.ndarray
+    covariances: np.ndarray
+    opacities: np.ndarray
+    sh: np.ndarray
+
 
 def prepare(gaussian_map: GaussianMap) -> PreparedMap:
-    """Prepare a map for CpuRenderer. The result shares no memory with the map."""
+    """Prepare a map for a renderer. The result shares no memory with the map."""
     means, scales, rotations, opacities, sh = (
         np.ascontiguousarray(values, dtype=np.float32)
         for values in (
@@ -93,7 +129,7 @@ def prepare(gaussian_map: GaussianMap) -> PreparedMap:
 
 
 def _drawing_order(seen: np.ndarray, means: np.ndarray, scales: np.ndarray, keys: np.ndarray) -> np.ndarray:
-    """Indices (n,) int32 of the Gaussians `seen` (N,) bool, neighbours in space beside each other, small ones first.
+    """Return the indices (n,) int32 of the Gaussians `seen` (N,) bool, neighbours in space together, small ones first.
 
     Args:
         keys: (n,) uint64, to work in.
@@ -150,7 +186,7 @@ def _make_keys(keys, means, scales, low, cell, size, morton_bits, index_bits):
 
 @njit
 def _half_bits(value):
-    """The bits, as an int16, of a float32 rounded to half precision; 0 for what is below its normal numbers.
+    """Return the bits, as an int16, of a float32 rounded to half precision; 0 for what is below its normal numbers.
 
     With whole numbers, as in lanes.load_halves: not all CPUs have an instruction for it.
     """
@@ -170,7 +206,7 @@ def _fill_chunks(order, means, scales, rotations, opacities, sh, gaussians, sh_b
             place = chunk * CHUNK + slot
             if place >= len(order):
                 rows[:, slot] = 0
-                rows[LOG_OPACITY, slot] = -np.inf
+                rows[LOG2_OPACITY, slot] = -np.inf
                 sh_bits[chunk, :, slot] = 0
                 continue
             i = order[place]
@@ -180,19 +216,19 @@ def _fill_chunks(order, means, scales, rotations, opacities, sh, gaussians, sh_b
             xa, xb, xc = (a * (1 - 2 * (y * y + z * z)), b * 2 * (x * y - w * z), c * 2 * (x * z + w * y))
             ya, yb, yc = (a * 2 * (x * y + w * z), b * (1 - 2 * (x * x + z * z)), c * 2 * (y * z - w * x))
             za, zb, zc = (a * 2 * (x * z - w * y), b * 2 * (y * z + w * x), c * (1 - 2 * (x * x + y * y)))
-            rows[X, slot], rows[Y, slot], rows[Z, slot] = means[i]
-            rows[XX, slot] = xa * xa + xb * xb + xc * xc
-            rows[XY, slot] = xa * ya + xb * yb + xc * yc
-            rows[XZ, slot] = xa * za + xb * zb + xc * zc
-            rows[YY, slot] = ya * ya + yb * yb + yc * yc
-            rows[YZ, slot] = ya * za + yb * zb + yc * zc
-            rows[ZZ, slot] = za * za + zb * zb + zc * zc
-            rows[LOG_OPACITY, slot] = math.log2(opacities[i])
+            rows[MEAN_X, slot], rows[MEAN_Y, slot], rows[MEAN_Z, slot] = means[i]
+            rows[COV_XX, slot] = xa * xa + xb * xb + xc * xc
+            rows[COV_XY, slot] = xa * ya + xb * yb + xc * yc
+            rows[COV_XZ, slot] = xa * za + xb * zb + xc * zc
+            rows[COV_YY, slot] = ya * ya + yb * yb + yc * yc
+            rows[COV_YZ, slot] = ya * za + yb * zb + yc * zc
+            rows[COV_ZZ, slot] = za * za + zb * zb + zc * zc
+            rows[LOG2_OPACITY, slot] = math.log2(opacities[i])
             for k in range(sh.shape[1]):
                 sh_bits[chunk, k, slot] = _half_bits(sh[i, k])
             # How many standard deviations from the centre alpha falls to MIN_ALPHA.
             deviations = math.sqrt(max(2 * math.log(opacities[i] / MIN_ALPHA), 0.0))
-            for axis, variance in enumerate((rows[XX, slot], rows[YY, slot], rows[ZZ, slot])):
+            for axis, variance in enumerate((rows[COV_XX, slot], rows[COV_YY, slot], rows[COV_ZZ, slot])):
                 mean = means[i, axis]
                 # A little more, for the rounding to float32.
                 reach = 1.00001 * deviations * math.sqrt(variance) + 1e-6 * abs(mean)

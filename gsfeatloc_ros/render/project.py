@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit, prange
 
 from gsfeatloc_ros.render import base, prepare
+from gsfeatloc_ros.render.kernels import njit, prange
 from gsfeatloc_ros.render.lanes import (
     LANES,
     bits_of_float,
+    broadcast,
     floor,
     load,
     load_halves,
@@ -19,7 +20,6 @@ from gsfeatloc_ros.render.lanes import (
     maximum,
     minimum,
     offsets,
-    spread,
     sqrt,
     store_columns,
 )
@@ -39,7 +39,7 @@ _EPS2D, _NEAR = _F(base.EPS2D), _F(base.NEAR_PLANE)
 _LOG_MIN_ALPHA = _F(math.log2(base.MIN_ALPHA))
 # From -0.5 d^T conic d, and from 2 ln(255 opacity), to base 2.
 _CONIC_SCALE = _F(-0.5 * math.log2(math.e))
-_REACH_SCALE = _F(2.0 * math.log(2.0))
+_RADIUS2_SCALE = _F(2.0 * math.log(2.0))
 # Spherical harmonics' constants, as in render/reference.py.
 _SH0, _SH1 = _F(0.28209479177387814), _F(0.4886025119029199)
 _SH2A, _SH2B, _SH2C = (_F(1.0925484305920792), _F(0.31539156525252005), _F(0.5462742152960396))
@@ -101,9 +101,9 @@ def _project_group(chunk, group, gaussians, sh, harmonics, antialiased, view, sp
     at = chunk * prepare.ROWS * CHUNK + group
     r = view.rotation
     points = (
-        load(gaussians, at + prepare.X * CHUNK),
-        load(gaussians, at + prepare.Y * CHUNK),
-        load(gaussians, at + prepare.Z * CHUNK),
+        load(gaussians, at + prepare.MEAN_X * CHUNK),
+        load(gaussians, at + prepare.MEAN_Y * CHUNK),
+        load(gaussians, at + prepare.MEAN_Z * CHUNK),
     )
     # The depth exact to its last bit: splats are drawn in its order, and neighbours are closer than roundings.
     o, f = view.origin, view.forward
@@ -118,9 +118,9 @@ def _project_group(chunk, group, gaussians, sh, harmonics, antialiased, view, sp
     sx, sy = view.fx * inverse_z, view.fy * inverse_z
     ax, ay, az = (sx * (r[0, 0] - u * r[2, 0]), sx * (r[0, 1] - u * r[2, 1]), sx * (r[0, 2] - u * r[2, 2]))
     bx, by, bz = (sy * (r[1, 0] - v * r[2, 0]), sy * (r[1, 1] - v * r[2, 1]), sy * (r[1, 2] - v * r[2, 2]))
-    sxx, sxy = (load(gaussians, at + prepare.XX * CHUNK), load(gaussians, at + prepare.XY * CHUNK))
-    sxz, syy = (load(gaussians, at + prepare.XZ * CHUNK), load(gaussians, at + prepare.YY * CHUNK))
-    syz, szz = (load(gaussians, at + prepare.YZ * CHUNK), load(gaussians, at + prepare.ZZ * CHUNK))
+    sxx, sxy = (load(gaussians, at + prepare.COV_XX * CHUNK), load(gaussians, at + prepare.COV_XY * CHUNK))
+    sxz, syy = (load(gaussians, at + prepare.COV_XZ * CHUNK), load(gaussians, at + prepare.COV_YY * CHUNK))
+    syz, szz = (load(gaussians, at + prepare.COV_YZ * CHUNK), load(gaussians, at + prepare.COV_ZZ * CHUNK))
     cax, cay, caz = (sxx * ax + sxy * ay + sxz * az, sxy * ax + syy * ay + syz * az, sxz * ax + syz * ay + szz * az)
     cbx, cby, cbz = (sxx * bx + sxy * by + sxz * bz, sxy * bx + syy * by + syz * bz, sxz * bx + syz * by + szz * bz)
     cov_xx, cov_xy, cov_yy = (
@@ -133,11 +133,11 @@ def _project_group(chunk, group, gaussians, sh, harmonics, antialiased, view, sp
     determinant = sharp_determinant + _EPS2D * (cov_xx + cov_yy + _EPS2D)
     cov_xx, cov_yy = cov_xx + _EPS2D, cov_yy + _EPS2D
 
-    log_opacity = load(gaussians, at + prepare.LOG_OPACITY * CHUNK)
+    log_opacity = load(gaussians, at + prepare.LOG2_OPACITY * CHUNK)
     if antialiased:
         log_opacity = log_opacity + _F(0.5) * log2(sharp_determinant / determinant)
     # The ellipse in which alpha is at least MIN_ALPHA, and the pixels in its box.
-    r2 = (log_opacity - _LOG_MIN_ALPHA) * _REACH_SCALE
+    r2 = (log_opacity - _LOG_MIN_ALPHA) * _RADIUS2_SCALE
     reach_x, reach_y = sqrt(r2 * cov_xx), sqrt(r2 * cov_yy)
     left, right = (_ceil(maximum(px - reach_x, _ZERO)), floor(minimum(px + reach_x, _F(view.width - 1))))
     top, bottom = (_ceil(maximum(py - reach_y, _ZERO)), floor(minimum(py + reach_y, _F(view.height - 1))))
@@ -190,8 +190,8 @@ def _ceil(x):
 @njit
 def _colors(sh, at, harmonics, x, y, z):
     """Red, green and blue of spherical harmonics in the unit directions x, y, z."""
-    half = spread(_F(0.5))
-    color = _add_harmonic(sh, at, 0, spread(_SH0), (half, half, half))
+    half = broadcast(_F(0.5))
+    color = _add_harmonic(sh, at, 0, broadcast(_SH0), (half, half, half))
     if harmonics > 1:
         color = _add_harmonic(sh, at, 1, -_SH1 * y, color)
         color = _add_harmonic(sh, at, 2, _SH1 * z, color)

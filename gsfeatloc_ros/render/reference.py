@@ -20,6 +20,7 @@ from gsfeatloc_ros.render.base import (
     NEAR_PLANE,
     Render,
     SplatRenderer,
+    Stage,
 )
 
 
@@ -35,7 +36,7 @@ class ReferenceRenderer(SplatRenderer):
         self._sh = torch.from_numpy(gaussian_map.sh).double()
         self._background = torch.tensor(background, dtype=torch.float64)
 
-    def _render(self, camera: Camera, T_splat_camera: np.ndarray) -> Render:
+    def _render(self, camera: Camera, T_splat_camera: np.ndarray, stage: Stage) -> Render:
         rotation = torch.from_numpy(T_splat_camera[:3, :3].T.copy()).double()  # splat to camera
         center = torch.from_numpy(T_splat_camera[:3, 3].copy()).double()
         offsets = self._means - center
@@ -96,7 +97,7 @@ class ReferenceRenderer(SplatRenderer):
 
 
 def _covariances(gaussian_map: GaussianMap) -> torch.Tensor:
-    """Covariances (N, 3, 3) of the Gaussians in the map frame: R diag(scale^2) R^T."""
+    """Return the covariances (N, 3, 3) of the Gaussians in the splat frame: R diag(scale^2) R^T."""
     w, x, y, z = torch.from_numpy(gaussian_map.rotations).double().unbind(1)
     rotation = torch.stack(
         [
@@ -111,7 +112,10 @@ def _covariances(gaussian_map: GaussianMap) -> torch.Tensor:
 
 
 def _project(camera: Camera, points: torch.Tensor, covariances: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Pixels (N, 2) and image covariances (N, 2, 2), not blurred, of Gaussians in the camera frame (EWA, eq. 29-31)."""
+    """Project Gaussians of the camera frame to pixels (N, 2) and image covariances (N, 2, 2), not blurred.
+
+    EWA, eq. 29-31.
+    """
     (fx, _, cx), (_, fy, cy) = camera.K[0], camera.K[1]
     x, y, z = points.unbind(1)
     pixels = torch.stack([fx * x / z + cx, fy * y / z + cy], 1)
@@ -130,7 +134,7 @@ def _project(camera: Camera, points: torch.Tensor, covariances: torch.Tensor) ->
 
 
 def _colors(sh: torch.Tensor, offsets: torch.Tensor) -> torch.Tensor:
-    """Colours (N, 3) of spherical harmonics (N, C, 3) seen along offsets (N, 3) from the camera, in the map frame."""
+    """Return the colours (N, 3) of harmonics (N, C, 3) seen along offsets (N, 3) from the camera, splat frame."""
     x, y, z = torch.nn.functional.normalize(offsets, dim=1).unbind(1)
     basis = [
         torch.full_like(x, 0.28209479177387814),

@@ -27,7 +27,7 @@ from gsfeatloc_ros.localize.estimate import Status
 from gsfeatloc_ros.localize.localizer import Localizer, LocalizerOptions
 from gsfeatloc_ros.maps import load_map
 from gsfeatloc_ros.match import DEFAULT_MATCHER, MATCHERS, create_matcher
-from gsfeatloc_ros.render import create_renderer
+from gsfeatloc_ros.render import DrawOptions, create_renderer
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ def _ask(options: argparse.Namespace, matcher_name: str) -> list[Answer]:
     scenes = [load_scene(folder) for folder in options.scene]
     answers = []
     for scene in scenes:
-        renderer = create_renderer(load_map(scene.map_path), background=scene.background)
+        renderer = create_renderer(load_map(scene.map_path), options=DrawOptions(scene.background))
         localizer = Localizer(renderer, matcher, LocalizerOptions(seed=options.seed))
         others = [other for other in scenes if other is not scene]
         strangers = draw_strangers(scene, others, options.sigma, options.seed, options.limit)

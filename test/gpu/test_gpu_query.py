@@ -52,7 +52,7 @@ def renderer(room_map) -> OnGpu:
 
 @pytest.mark.parametrize("name", ["sift", "xfeat", "xfeat-lighterglue"])
 def test_finds_the_camera_as_on_the_cpu(gpu, renderer, room_map, room_camera, room_photos, name) -> None:
-    on_gpu = Localizer(renderer, MATCHERS[name]("", 2048, gpu.device))
+    on_gpu = Localizer(renderer, MATCHERS[name].create("", 2048, gpu.device))
     on_cpu = Localizer(CpuRenderer(room_map), create_matcher(name, device="cpu"))
     for photo in room_photos[:3]:
         there, here = (
@@ -69,7 +69,7 @@ def test_finds_the_camera_as_on_the_cpu(gpu, renderer, room_map, room_camera, ro
 def test_no_picture_leaves_the_gpu_before_the_pose_is_solved(
     gpu, renderer, room_camera, room_photos, name, monkeypatch
 ) -> None:
-    localizer = Localizer(renderer, MATCHERS[name]("", 2048, gpu.device))
+    localizer = Localizer(renderer, MATCHERS[name].create("", 2048, gpu.device))
     left = []
     judge = localizer._judge
 
@@ -102,7 +102,7 @@ def test_a_matcher_on_the_cpu_takes_renders_of_a_gpu(gpu, renderer, room_camera,
 
 def test_a_dark_photo_has_no_answer(gpu, renderer, room_camera, room_photos) -> None:
     photo = room_photos[0]
-    estimate = Localizer(renderer, MATCHERS["sift"]("", 2048, gpu.device)).localize(
+    estimate = Localizer(renderer, MATCHERS["sift"].create("", 2048, gpu.device)).localize(
         np.zeros_like(photo.image), room_camera, photo.T_map_camera_prior
     )
     assert estimate.status is Status.FAILED
@@ -112,7 +112,7 @@ def test_a_dark_photo_has_no_answer(gpu, renderer, room_camera, room_photos) -> 
 def test_a_render_of_nothing_has_no_answer(gpu, room_map, room_camera, room_photos) -> None:
     photo = room_photos[0]
     nothing = OnGpu(replace(room_map, means=room_map.means + np.float32([0, 0, 1e4])))
-    estimate = Localizer(nothing, MATCHERS["sift"]("", 2048, gpu.device)).localize(
+    estimate = Localizer(nothing, MATCHERS["sift"].create("", 2048, gpu.device)).localize(
         photo.image, room_camera, photo.T_map_camera_prior
     )
     assert estimate.status is Status.FAILED

@@ -21,7 +21,7 @@ from gsfeatloc_ros.match.base import Matcher
 from gsfeatloc_ros.match.disk import DiskExtractor
 from gsfeatloc_ros.match.lightglue import LightGlueMatcher
 from gsfeatloc_ros.match.xfeat import XFeatMatcher
-from gsfeatloc_ros.render.depth_bins import SLABS, Slabs
+from gsfeatloc_ros.render.depth_bins import BINS, DepthBins
 
 MIXED = "two devices"
 
@@ -306,7 +306,7 @@ def test_computes_what_the_cpu_computes(gpu, compute) -> None:
     assert torch.equal(found.cpu(), wanted)
 
 
-def test_slabs(gpu) -> None:
+def test_depth_bins(gpu) -> None:
     rng = np.random.default_rng(0)
     depths = torch.from_numpy(rng.uniform(1, 9, 500).astype(np.float32))
     areas = torch.from_numpy(rng.integers(1, 90, 500))
@@ -314,15 +314,15 @@ def test_slabs(gpu) -> None:
 
     def statistics(*tensors: torch.Tensor) -> torch.Tensor:
         depths, areas, weights = tensors
-        slabs = Slabs.of(depths, areas)
-        return torch.stack(slabs.statistics(weights @ slabs.channels(depths)))
+        bins = DepthBins.of(depths, areas)
+        return torch.stack(bins.statistics(weights @ bins.channels(depths)))
 
     wanted = statistics(depths, areas, weights)
     on_device = [tensor.to(gpu.device) for tensor in (depths, areas, weights)]
     gpu.reset()
     found = statistics(*on_device)
     assert (gpu.to_host, gpu.to_device, gpu.waits) == ([], [], [])
-    assert 0 < len(gpu.operations) < 10 * SLABS
+    assert 0 < len(gpu.operations) < 10 * BINS
     assert torch.equal(found.cpu(), wanted)
 
 

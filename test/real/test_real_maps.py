@@ -14,7 +14,7 @@ from small_maps import assert_same
 from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.geometry import make_pose, so3_exp
 from gsfeatloc_ros.maps import GaussianMap, load_map
-from gsfeatloc_ros.render import create_renderer
+from gsfeatloc_ros.render import DrawOptions, create_renderer
 from gsfeatloc_ros.render.reference import ReferenceRenderer
 
 
@@ -48,7 +48,7 @@ def test_two_formats_of_a_scene_render_alike(maps, one, other, decibels):
     assert len(a) == len(b)
     camera = Camera(240, 240, np.array([[240.0, 0, 119.5], [0, 240.0, 119.5], [0, 0, 1]]))
     for pose in views(a, 4):
-        x, y = (create_renderer(m, background=(0.5, 0.5, 0.5)).render(camera, pose) for m in (a, b))
+        x, y = (create_renderer(m, options=DrawOptions((0.5, 0.5, 0.5))).render(camera, pose) for m in (a, b))
         seen = x.alpha > 0.1
         assert seen.mean() > 0.03
         assert -10 * np.log10(np.mean((x.rgb[seen].astype(np.float64) - y.rgb[seen]) ** 2)) > decibels

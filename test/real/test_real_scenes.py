@@ -11,7 +11,7 @@ import pytest
 from gsfeatloc_ros.evaluate.protocol import PriorError, paper_bounds, paper_prior_error, trajectory_radius
 from gsfeatloc_ros.evaluate.scene import load_scene
 from gsfeatloc_ros.maps import load_map
-from gsfeatloc_ros.render import create_renderer
+from gsfeatloc_ros.render import DrawOptions, create_renderer
 
 
 @pytest.mark.parametrize(
@@ -30,7 +30,7 @@ def test_scenes_are_complete(scenes, name, photos, frames, background):
 @pytest.mark.parametrize("name", ["bonsai", "lego"])
 def test_photos_and_renders_lie_on_each_other_to_the_half_pixel(scenes, name):
     scene = load_scene(scenes / name)
-    renderer = create_renderer(load_map(scene.map_path), background=scene.background)
+    renderer = create_renderer(load_map(scene.map_path), options=DrawOptions(scene.background))
     width, height = scene.camera.width // 2, scene.camera.height // 2
     photos = [(p, cv2.resize(scene.read_photo(p), (width, height), interpolation=cv2.INTER_AREA)) for p in scene.photos]
 

