@@ -9,6 +9,8 @@ from xml.etree import ElementTree
 import pytest
 import yaml
 
+from gsfeatloc_ros.match import MATCHERS
+
 ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "gsfeatloc_ros"
 DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -108,6 +110,15 @@ def test_parameters_are_those_of_the_node(document: Path) -> None:
         for group, name in re.findall(rf"(?<![\w./-])({'|'.join(groups)})\.(\w+)(?=:=|$|`)", code):
             if name not in ("ply", "md", "yaml", "csv"):
                 assert name in groups[group], f"{group}.{name}"
+
+
+def test_matchers_are_those_of_the_code() -> None:
+    text = (ROOT / "docs/matchers.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| (`.*)", text.split("\n## ")[0], re.MULTILINE)
+    experimental = {
+        name: "**experimental**" in row for row in rows for name in re.findall(r"`([a-z-]+)`", row.split(" | ")[0])
+    }
+    assert experimental == {name: entry.experimental for name, entry in MATCHERS.items()}
 
 
 def test_readme_shows_the_example_as_it_is() -> None:
