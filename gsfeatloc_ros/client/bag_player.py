@@ -1,4 +1,4 @@
-"""Play a recorded bag into a running localizer, photo by photo, and collect its answers."""
+"""Play a recorded bag into a running localizer, photo by photo, and collect its replies."""
 
 from __future__ import annotations
 
@@ -8,17 +8,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.serialization import deserialize_message
 from rosbags.rosbag2 import Reader
 from sensor_msgs.msg import CameraInfo, Image
 
-from gsfeatloc_ros.common.geometry import make_pose, matrix_from_quaternion
-from gsfeatloc_ros.node.diagnostics import stamp_text
+from gsfeatloc_ros.client.client_node import ClientNode
+from gsfeatloc_ros.client.messages import pose_matrix, read_diagnostics, stamp_of
+from gsfeatloc_ros.client.process import START_TIMEOUT
+from gsfeatloc_ros.node.qos import LATCHED
 
 # Seconds from a photo's prior and camera info to the photo itself: topics have no order, and it must not overtake them.
 # (To wait for their acknowledgment would take seconds: it comes with Fast DDS's heartbeat.)
@@ -29,7 +28,7 @@ _SETTLING = 0.5
 
 @dataclass(frozen=True)
 class Topics:
-    """Names of the topics in the bag, on which the localizer listens too."""
+    """Names of the topics in the bag, to which the localizer listens too."""
 
     image: str
     camera_info: str
@@ -37,14 +36,14 @@ class Topics:
 
 
 @dataclass(frozen=True, eq=False)
-class Answer:
+class Reply:
     """What the localizer said to one photo.
 
     Attributes:
         stamp: of the photo, seconds with nine decimals.
         T_map_camera: (4, 4) pose that was published; None when there was none.
-        evidence: the values of the localizer's diagnostic by key (status, reason, inliers ...); empty without answer.
-        milliseconds: wall time from sending the photo until the answer had come; NaN without answer.
+        evidence: the values of the localizer's diagnostic by key (status, reason, inliers ...); empty without a reply.
+        milliseconds: wall time from sending the photo until the reply had come; NaN without one.
     """
 
     stamp: str
@@ -57,65 +56,56 @@ def play_bag(
     path: str | Path,
     topics: Topics,
     is_running: Callable[[], bool],
-    start_timeout: float = 180.0,
-    answer_timeout: float = 30.0,
-) -> Iterator[Answer]:
-    """Publish every photo of a bag, after its camera info and prior, and yield the localizer's answer to it.
+    start_timeout: float = START_TIMEOUT,
+    reply_timeout: float = 30.0,
+) -> Iterator[Reply]:
+    """Publish every photo of a bag, after its camera info and prior, and yield the localizer's reply to it.
 
-    The next photo is sent when the answer is there, or after `answer_timeout` seconds without one.
+    The next photo is sent when the reply is there, or after `reply_timeout` seconds without one.
 
     Args:
         path: rosbag2 folder.
         topics: which topics to play.
         is_running: whether the localizer still runs; asked while waiting for it.
         start_timeout: seconds that the localizer may take to appear; it compiles its kernels at the first start.
+        reply_timeout: seconds that it may take to reply.
 
     Raises:
         RuntimeError: the localizer ended.
         TimeoutError: the localizer did not appear on its topics.
     """
-    context = rclpy.Context()
-    rclpy.init(context=context)
-    player = _Player(topics, is_running, context)
+    player = _Player(topics, is_running)
     try:
         player.wait_for_localizer(start_timeout)
         with Reader(path) as bag:
             played = [connection for connection in bag.connections if connection.topic in player.publishers]
             for connection, _, cdr in bag.messages(played):
                 if connection.topic == topics.image:
-                    yield player.ask(bytes(cdr), answer_timeout)
+                    yield player.localize(bytes(cdr), reply_timeout)
                 else:
                     player.publishers[connection.topic].publish(bytes(cdr))
     finally:
         player.close()
-        rclpy.shutdown(context=context)
 
 
-class _Player:
-    """A node that publishes the bag's topics and remembers what the localizer says."""
+class _Player(ClientNode):
+    """A node that publishes the topics of a bag and remembers what the localizer says."""
 
-    def __init__(self, topics: Topics, is_running: Callable[[], bool], context: rclpy.Context) -> None:
+    def __init__(self, topics: Topics, is_running: Callable[[], bool]) -> None:
+        super().__init__("bag_player")
         self._topics, self._is_running = topics, is_running
         self._poses: dict[str, np.ndarray] = {}
         self._evidence: dict[str, dict[str, str]] = {}
-        self._node = rclpy.create_node("bag_player", context=context)
-        self._executor = SingleThreadedExecutor(context=context)
-        self._executor.add_node(self._node)
         types = {topics.image: Image, topics.camera_info: CameraInfo, topics.prior: PoseStamped}
-        self.publishers = {topic: self._node.create_publisher(kind, topic, 10) for topic, kind in types.items()}
-        latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self.publishers = {topic: self.node.create_publisher(kind, topic, 10) for topic, kind in types.items()}
         self._subscriptions = (
-            self._node.create_subscription(PoseWithCovarianceStamped, "pose", self._on_pose, latched),
-            self._node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 100),
+            self.node.create_subscription(PoseWithCovarianceStamped, "pose", self._on_pose, LATCHED),
+            self.node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 100),
         )
 
-    def close(self) -> None:
-        self._executor.shutdown()
-        self._node.destroy_node()
-
     def wait_for_localizer(self, timeout: float) -> None:
-        """Wait until the localizer hears all topics and is heard on its own."""
-        found = self._spin_until(
+        """Wait until the localizer listens to all topics and is heard on its own."""
+        found = self._wait_until(
             lambda: (
                 all(publisher.get_subscription_count() for publisher in self.publishers.values())
                 and all(subscription.get_publisher_count() for subscription in self._subscriptions)
@@ -127,38 +117,35 @@ class _Player:
         # It may take a moment longer to find us, and would miss the first camera info: that is sent with best effort.
         time.sleep(_SETTLING)
 
-    def ask(self, cdr: bytes, timeout: float) -> Answer:
+    def localize(self, cdr: bytes, timeout: float) -> Reply:
         """Publish a serialized photo and wait for what the localizer says to it."""
-        stamp = stamp_text(deserialize_message(cdr, Image).header.stamp)
+        stamp = stamp_of(deserialize_message(cdr, Image))
         time.sleep(_HEAD_START)
         start = time.monotonic()
         self.publishers[self._topics.image].publish(cdr)
-        answered = self._spin_until(lambda: self._is_answered(stamp), timeout)
-        milliseconds = 1e3 * (time.monotonic() - start) if answered else float("nan")
-        return Answer(stamp, self._poses.get(stamp), self._evidence.get(stamp, {}), milliseconds)
+        replied = self._wait_until(lambda: self._has_reply(stamp), timeout)
+        milliseconds = 1e3 * (time.monotonic() - start) if replied else float("nan")
+        return Reply(stamp, self._poses.get(stamp), self._evidence.get(stamp, {}), milliseconds)
 
-    def _is_answered(self, stamp: str) -> bool:
-        said = self._evidence.get(stamp)
-        return said is not None and (said["status"] != "localized" or stamp in self._poses)
+    def _has_reply(self, stamp: str) -> bool:
+        evidence = self._evidence.get(stamp)
+        return evidence is not None and (evidence["status"] != "localized" or stamp in self._poses)
 
-    def _spin_until(self, condition: Callable[[], bool], timeout: float) -> bool:
-        """Take messages until the condition holds; False when it does not within the timeout."""
-        deadline = time.monotonic() + timeout
-        while not condition():
-            if not self._is_running():
-                raise RuntimeError("the localizer has ended")
-            if time.monotonic() > deadline:
-                return False
-            self._executor.spin_once(timeout_sec=0.1)
-        return True
+    def _wait_until(self, condition: Callable[[], bool], timeout: float) -> bool:
+        """Take messages until the condition holds; return False when it does not within `timeout` seconds.
+
+        Raises:
+            RuntimeError: the localizer ended.
+        """
+        found = self.spin_until(lambda: condition() or not self._is_running(), timeout)
+        if found and not condition():
+            raise RuntimeError("the localizer has ended")
+        return found
 
     def _on_pose(self, message: PoseWithCovarianceStamped) -> None:
-        position, orientation = message.pose.pose.position, message.pose.pose.orientation
-        rotation = matrix_from_quaternion([orientation.x, orientation.y, orientation.z, orientation.w])
-        self._poses[stamp_text(message.header.stamp)] = make_pose(rotation, [position.x, position.y, position.z])
+        self._poses[stamp_of(message)] = pose_matrix(message)
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
-        for status in message.status:
-            values = {item.key: item.value for item in status.values}
-            if "localizer" in status.name and "stamp" in values:
-                self._evidence[values["stamp"]] = values
+        for diagnostic in read_diagnostics(message):
+            if "localizer" in diagnostic.name and "stamp" in diagnostic.values:
+                self._evidence[diagnostic.values["stamp"]] = diagnostic.values

@@ -9,16 +9,15 @@ import cv2
 import numpy as np
 import pytest
 
-from gsfeatloc_ros.client.bag_player import Answer, Topics, play_bag
+from gsfeatloc_ros.client.bag_player import Reply, play_bag
+from gsfeatloc_ros.client.process import running_localizer
+from gsfeatloc_ros.client.score import score
 from gsfeatloc_ros.simulate import write_bag
-from gsfeatloc_ros.simulate.bag import CAMERA_INFO_TOPIC, IMAGE_TOPIC, PRIOR_TOPIC
-from gsfeatloc_ros.tools.demo import Result, running_localizer, summary
-
-TOPICS = Topics(IMAGE_TOPIC, CAMERA_INFO_TOPIC, PRIOR_TOPIC)
+from gsfeatloc_ros.tools.demo import TOPICS, row, summary
 
 
 def test_demo_localizes_photos_of_a_bag(tmp_path):
-    command = [sys.executable, "-m", "gsfeatloc_ros.tools.demo", "--queries", "3", "--matcher", "sift"]
+    command = [sys.executable, "-m", "gsfeatloc_ros.tools.demo", "--photos", "3", "--matcher", "sift"]
     done = subprocess.run([*command, "--out", tmp_path], capture_output=True, text=True, timeout=400)
     assert done.returncode == 0, done.stdout + done.stderr
     lines = done.stdout.splitlines()
@@ -28,20 +27,20 @@ def test_demo_localizes_photos_of_a_bag(tmp_path):
     assert "ready" in (tmp_path / "localizer.log").read_text()
 
 
-def answer_to(photo, T_map_camera, **evidence) -> Answer:
-    return Answer("100.000000000", T_map_camera, evidence, 250.0)
+def reply(T_map_camera, **evidence) -> Reply:
+    return Reply("100.000000000", T_map_camera, evidence, 250.0)
 
 
 def test_failures_and_wrong_answers_are_not_successes(room_photos):
     photo = room_photos[0]
-    good = Result.of(photo, answer_to(photo, photo.T_map_camera, inliers="99"))
-    wrong = Result.of(photo, answer_to(photo, photo.T_map_camera_prior, inliers="21"))
-    refused = Result.of(photo, answer_to(photo, None, reason="7 inliers between the photo and the render"))
-    silent = Result.of(photo, Answer("100.000000000", None, {}, float("nan")))
-    assert [result.success for result in (good, wrong, refused, silent)] == [True, False, False, False]
-    assert "0.000 deg   0.00 cm        99     250" in good.row(1)
-    assert refused.row(3).endswith("no answer: 7 inliers between the photo and the render")
-    assert silent.row(4).endswith("no answer: none came in time")
+    good = score(photo, reply(photo.T_map_camera, inliers="99"))
+    wrong = score(photo, reply(photo.T_map_camera_prior, inliers="21"))
+    refused = score(photo, reply(None, reason="7 inliers between the photo and the render"))
+    silent = score(photo, Reply("100.000000000", None, {}, float("nan")))
+    assert [each.success for each in (good, wrong, refused, silent)] == [True, False, False, False]
+    assert "0.000 deg   0.00 cm        99     250" in row(1, good)
+    assert row(3, refused).endswith("no answer: 7 inliers between the photo and the render")
+    assert row(4, silent).endswith("no answer: none came in time")
     assert summary([good, good, good, refused]) == (
         "localized 3 of 4 (75 %) within 1 degree and 2 cm; median error 0.00 degrees, 0.0 cm; median 250 ms"
     )
@@ -61,20 +60,20 @@ def test_player_says_when_there_is_no_localizer(bag):
 
 def test_player_says_when_the_localizer_has_ended(bag, tmp_path):
     with (
-        running_localizer(tmp_path / "no_such_map.ply", "sift", tmp_path / "log") as process,
+        running_localizer({"map.path": tmp_path / "no_such_map.ply"}, log=tmp_path / "log") as localizer,
         pytest.raises(RuntimeError, match="the localizer has ended"),
     ):
-        next(play_bag(bag, TOPICS, is_running=lambda: process.poll() is None))
+        next(play_bag(bag, TOPICS, is_running=lambda: localizer.alive))
     assert "no_such_map.ply" in (tmp_path / "log").read_text()
 
 
 def test_localizer_is_gone_after_the_demo_even_when_it_is_interrupted(room_map_file, tmp_path):
-    with pytest.raises(KeyboardInterrupt), running_localizer(room_map_file, "sift", tmp_path / "log") as process:
+    with pytest.raises(KeyboardInterrupt), running_localizer({"map.path": room_map_file}) as localizer:
         raise KeyboardInterrupt
-    assert process.poll() is not None
+    assert not localizer.alive
 
 
 def test_no_answer_leaves_the_error_unknown(room_photos):
-    result = Result.of(room_photos[0], answer_to(room_photos[0], None))
-    assert np.isnan(result.error).all()
-    assert result.prior_error[0] > 1
+    scored = score(room_photos[0], reply(None))
+    assert np.isnan(scored.error).all()
+    assert scored.prior_error[0] > 1

@@ -5,13 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from node_harness import (
-    assert_close,
-    connected_client,
-    rgb_image,
-    send_inputs,
-    text,
-)
+from node_harness import assert_close, connected_client, send_inputs
+
+from gsfeatloc_ros.client.messages import rgb_image, stamp_of
 
 
 def test_image_and_prior_give_the_pose(client, room_camera, photo):
@@ -46,8 +42,8 @@ def test_rendered_image_is_the_map_seen_from_the_estimate(client, room, room_cam
     send_inputs(client, room_camera, photo)
     image = rgb_image(photo.image)
     assert client.attempt(image).ok
-    assert client.spin_until(lambda: any(text(render) == text(image) for render in client.renders))
-    render = next(render for render in client.renders if text(render) == text(image))
+    assert client.spin_until(lambda: any(stamp_of(render) == stamp_of(image) for render in client.renders))
+    render = next(render for render in client.renders if stamp_of(render) == stamp_of(image))
     assert (render.encoding, render.header.frame_id) == ("rgb8", "camera_optical")
     rendered = np.frombuffer(render.data, np.uint8).reshape(render.height, render.width, 3) / 255.0
     # The room as a pinhole camera at the true pose would see it.

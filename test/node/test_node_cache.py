@@ -6,7 +6,9 @@ import shutil
 from pathlib import Path
 
 import pytest
-from node_harness import connected_client, info_of, prior_of, rgb_image, running_localizer
+from node_harness import connected_client, running_localizer
+
+from gsfeatloc_ros.client.messages import camera_info_of, pose_stamped, rgb_image
 
 
 @pytest.fixture
@@ -23,8 +25,8 @@ def test_answers_from_the_cache_are_the_same(map_file, room_camera, room_photos)
     poses = []
     for _ in range(2):
         with running_localizer(map__path=map_file, matcher__name="sift"), connected_client() as client:
-            client.send_camera_info(info_of(room_camera))
-            client.send_prior(prior_of(photo.T_map_camera_prior))
+            client.send_camera_info(camera_info_of(room_camera))
+            client.send_prior(pose_stamped(photo.T_map_camera_prior))
             message = rgb_image(photo.image)
             answer = client.attempt(message)
             assert answer.ok, answer.reason

@@ -3,31 +3,24 @@
 from __future__ import annotations
 
 from builtin_interfaces.msg import Time
-from node_harness import (
-    assert_answer,
-    assert_no_answer,
-    connected_client,
-    info_of,
-    prior_of,
-    rgb_image,
-    running_localizer,
-    stamped,
-)
+from node_harness import assert_answer, assert_no_answer, connected_client, running_localizer, stamped
 from rosgraph_msgs.msg import Clock
+
+from gsfeatloc_ros.client.messages import camera_info_of, pose_stamped, rgb_image
 
 
 def test_clock_jumps_back(room_map_file, room_camera, room_photos):
     photo = room_photos[0]
     parameters = {"map__path": room_map_file, "matcher__name": "sift", "use_sim_time": "true"}
     with running_localizer(**parameters) as localizer, connected_client() as client:
-        prior = prior_of(photo.T_map_camera_prior)
+        prior = pose_stamped(photo.T_map_camera_prior)
         client.publish("/clock", Clock(clock=Time(sec=1000)))
-        client.send_camera_info(info_of(room_camera))
+        client.send_camera_info(camera_info_of(room_camera))
         client.send_prior(stamped(prior, 1000))
         assert_answer(client, photo, 1001)
         client.publish("/clock", Clock(clock=Time(sec=900)))
         localizer.wait_for_output(r"time went back by 100\.0 s: what is stamped later is forgotten")
-        assert_no_answer(client, photo, "time went back: no prior yet: publish .* on /prior", 901)
+        assert_no_answer(client, rgb_image(photo.image), "time went back: no prior yet: publish .* on /prior", 901)
         client.send_image(stamped(rgb_image(photo.image), 902))
         client.spin(0.2)
         assert "time went back: no prior yet" in client.relocalize().message
@@ -35,10 +28,10 @@ def test_clock_jumps_back(room_map_file, room_camera, room_photos):
         assert_answer(client, photo, 903)
         # What was still on its way.
         client.send_prior(stamped(prior, 1000))
-        assert_no_answer(client, photo, r"prior is 96\.0 s newer than the image .*prior_max_age", 904)
+        assert_no_answer(client, rgb_image(photo.image), r"prior is 96\.0 s newer than the image .*prior_max_age", 904)
         client.publish("/clock", Clock(clock=Time(sec=0)))
         localizer.wait_for_output(r"time went back by 900\.0 s")
-        assert_no_answer(client, photo, "time went back: no prior yet", 1)
+        assert_no_answer(client, rgb_image(photo.image), "time went back: no prior yet", 1)
         client.send_prior(stamped(prior, 1))
         assert_answer(client, photo, 2)
         assert "Traceback" not in localizer.output

@@ -6,9 +6,10 @@ import threading
 from dataclasses import replace
 
 import rclpy
-from node_harness import assert_close, connected_client, info_of, node_arguments, prior_of, rgb_image
+from node_harness import assert_close, connected_client, node_arguments
 from rclpy.lifecycle import TransitionCallbackReturn
 
+from gsfeatloc_ros.client.messages import camera_info_of, pose_stamped, rgb_image
 from gsfeatloc_ros.node.localizer_node import LocalizerNode
 
 
@@ -39,8 +40,8 @@ def test_unforeseen_exception_is_reported_and_survived(room_map_file, room_camer
     spinning.start()
     try:
         with connected_client() as client:
-            client.send_camera_info(info_of(room_camera))
-            client.send_prior(prior_of(photo.T_map_camera_prior))
+            client.send_camera_info(camera_info_of(room_camera))
+            client.send_prior(pose_stamped(photo.T_map_camera_prior))
             image = rgb_image(photo.image)
             diagnostic = client.attempt(image)
             assert diagnostic.values["status"] == "error"

@@ -8,19 +8,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
-from node_harness import (
-    assert_close,
-    assert_start_fails,
-    connected_client,
-    info_of,
-    matrix_of,
-    prior_of,
-    rgb_image,
-    running_localizer,
-    text,
-)
+from geometry_msgs.msg import TransformStamped
+from node_harness import assert_close, assert_start_fails, connected_client, running_localizer
+from transforms import transform_stamped
 
+from gsfeatloc_ros.client.messages import (
+    camera_info_of,
+    pose_matrix,
+    pose_stamped,
+    pose_with_covariance,
+    rgb_image,
+    stamp_of,
+)
 from gsfeatloc_ros.common.geometry import invert, make_pose, matrix_from_quaternion, so3_exp
 
 # Last: a tf2_ros that is installed comes before it.
@@ -48,19 +47,9 @@ def T_map_base(photo):
     return make_pose(so3_exp(np.array([0.0, 0.0, yaw])), [*photo.T_map_camera[:2, 3], 0.0])
 
 
-def transform(parent: str, child: str, T_parent_child: np.ndarray, stamp) -> TransformStamped:
-    pose = prior_of(T_parent_child).pose
-    message = TransformStamped(child_frame_id=child)
-    message.header.frame_id, message.header.stamp = parent, stamp
-    translation, position = message.transform.translation, pose.position
-    translation.x, translation.y, translation.z = position.x, position.y, position.z
-    message.transform.rotation = pose.orientation
-    return message
-
-
 def tell_where_the_camera_is(client, T_base_camera: np.ndarray) -> tf2_ros.StaticTransformBroadcaster:
     broadcaster = tf2_ros.StaticTransformBroadcaster(client.node)
-    broadcaster.sendTransform(transform("base_link", "camera_optical", T_base_camera, client.next_stamp()))
+    broadcaster.sendTransform(transform_stamped("base_link", "camera_optical", T_base_camera, client.next_stamp()))
     return broadcaster
 
 
@@ -71,15 +60,15 @@ def test_priors_and_answers_of_the_base_and_tf_from_the_map_to_odom(tf, room_map
     with running_localizer(map__path=room_map_file, **ALIGNED) as process, connected_client() as client:
         static = tell_where_the_camera_is(client, T_base_camera)
         moving, heard = tf2_ros.TransformBroadcaster(client.node), client.listen(TFMessage, "/tf")
-        client.send_camera_info(info_of(room_camera))
-        client.send_prior(prior_of(T_map_base @ T_base_camera @ off @ invert(T_base_camera)))
+        client.send_camera_info(camera_info_of(room_camera))
+        client.send_prior(pose_stamped(T_map_base @ T_base_camera @ off @ invert(T_base_camera)))
         image = rgb_image(photo.image)
         image.header.stamp = client.next_stamp()
-        moving.sendTransform(transform("odom", "base_link", T_ODOM_BASE, image.header.stamp))
+        moving.sendTransform(transform_stamped("odom", "base_link", T_ODOM_BASE, image.header.stamp))
         client.spin(0.5)
         client.send_image(image)
-        assert client.spin_until(lambda: text(image) in client.poses), process.output
-        pose = client.poses[text(image)]
+        assert client.spin_until(lambda: stamp_of(image) in client.poses), process.output
+        pose = client.poses[stamp_of(image)]
         assert pose.header.frame_id == "map"
         assert_close(pose, T_map_base)
         assert (np.linalg.eigvalsh(np.reshape(pose.pose.covariance, (6, 6))) > 0).all()
@@ -97,7 +86,7 @@ def test_priors_and_answers_of_the_base_and_tf_from_the_map_to_odom(tf, room_map
         t, q = last.transform.translation, last.transform.rotation
         found = make_pose(matrix_from_quaternion([q.x, q.y, q.z, q.w]), [t.x, t.y, t.z])
         # The base is where the pose says.
-        np.testing.assert_allclose(found @ T_ODOM_BASE, matrix_of(pose), atol=1e-9)
+        np.testing.assert_allclose(found @ T_ODOM_BASE, pose_matrix(pose), atol=1e-9)
         np.testing.assert_allclose(found, T_map_odom, atol=0.1)
         client.node.destroy_publisher(static)  # kept until here: static transforms come from who told them
 
@@ -106,11 +95,9 @@ def test_initialpose_as_rviz_sends_it(tf, room_map_file, room_camera, photo, T_m
     """On the floor, a little off, with RViz's covariance: z, roll and pitch exactly known."""
     with running_localizer(map__path=room_map_file) as process, connected_client() as client:
         static = tell_where_the_camera_is(client, invert(T_map_base) @ photo.T_map_camera)
-        client.send_camera_info(info_of(room_camera))
+        client.send_camera_info(camera_info_of(room_camera))
         off = make_pose(so3_exp(np.array([0.0, 0.0, 0.3])), [0.2, -0.3, 0.0])
-        message = PoseWithCovarianceStamped()
-        message.header.frame_id = "map"
-        message.pose.pose = prior_of(T_map_base @ off).pose
+        message = pose_with_covariance(T_map_base @ off)
         message.pose.covariance[0] = message.pose.covariance[7] = 0.25
         message.pose.covariance[35] = 0.06853891909122467
         client.publish("initialpose", message)
@@ -125,9 +112,9 @@ def test_a_prior_in_the_frame_of_odom(tf, room_map_file, room_camera, photo):
     T_map_odom = make_pose(so3_exp(np.array([0.1, -0.2, 2.0])), [4.0, 5.0, -1.0])
     with running_localizer(map__path=room_map_file) as process, connected_client() as client:
         static = tf2_ros.StaticTransformBroadcaster(client.node)
-        static.sendTransform(transform("map", "odom", T_map_odom, client.next_stamp()))
-        client.send_camera_info(info_of(room_camera))
-        client.send_prior(prior_of(invert(T_map_odom) @ photo.T_map_camera_prior, "odom"))
+        static.sendTransform(transform_stamped("map", "odom", T_map_odom, client.next_stamp()))
+        client.send_camera_info(camera_info_of(room_camera))
+        client.send_prior(pose_stamped(invert(T_map_odom) @ photo.T_map_camera_prior, "odom"))
         image = rgb_image(photo.image)
         assert client.attempt(image).ok, process.output
         assert_close(client.pose_of(image), photo.T_map_camera)
@@ -135,8 +122,8 @@ def test_a_prior_in_the_frame_of_odom(tf, room_map_file, room_camera, photo):
 
 def test_a_camera_that_tf_does_not_know(tf, room_map_file, room_camera, photo):
     with running_localizer(map__path=room_map_file, pose_frame="base"), connected_client() as client:
-        client.send_camera_info(info_of(room_camera))
-        client.send_prior(prior_of(photo.T_map_camera_prior))
+        client.send_camera_info(camera_info_of(room_camera))
+        client.send_prior(pose_stamped(photo.T_map_camera_prior))
         image = rgb_image(photo.image)
         refused = client.attempt(image)
         assert refused.values["status"] == "refused"

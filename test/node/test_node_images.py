@@ -4,17 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from geometry_msgs.msg import PoseWithCovarianceStamped
-from node_harness import (
-    assert_close,
-    compressed_image,
-    connected_client,
-    info_of,
-    prior_of,
-    running_localizer,
-)
+from node_harness import assert_close, compressed_image, connected_client, running_localizer
 from sensor_msgs.msg import CompressedImage
 
+from gsfeatloc_ros.client.messages import camera_info_of, pose_stamped, pose_with_covariance
 from gsfeatloc_ros.common.geometry import make_pose, so3_exp
 
 
@@ -33,23 +26,15 @@ def client(localizer):
 @pytest.fixture
 def rectified_info(room_camera):
     """As a stereo driver sends it: K and D are of the raw image, P of the rectified one."""
-    info = info_of(room_camera)
+    info = camera_info_of(room_camera)
     info.p = np.column_stack([room_camera.K, np.zeros(3)]).ravel().tolist()
     return info
-
-
-def with_covariance(T_map_camera: np.ndarray, covariance: np.ndarray) -> PoseWithCovarianceStamped:
-    prior = prior_of(T_map_camera)
-    message = PoseWithCovarianceStamped(header=prior.header)
-    message.pose.pose = prior.pose
-    message.pose.covariance = covariance.ravel().tolist()
-    return message
 
 
 @pytest.mark.parametrize("extension", ["png", "jpg"])
 def test_compressed_rectified_images_are_localized(client, room_camera, rectified_info, photo, extension):
     client.send_camera_info(rectified_info)
-    client.send_prior(prior_of(photo.T_map_camera_prior))
+    client.send_prior(pose_stamped(photo.T_map_camera_prior))
     image = compressed_image(room_camera.undistort_image(photo.image), extension)
     diagnostic = client.attempt(image)
     assert diagnostic.ok, diagnostic
@@ -57,12 +42,12 @@ def test_compressed_rectified_images_are_localized(client, room_camera, rectifie
 
 
 def test_camera_info_without_p_is_refused(client, room_camera):
-    client.until_refused(lambda: client.send_camera_info(info_of(room_camera)), "a P of zeros")
+    client.until_refused(lambda: client.send_camera_info(camera_info_of(room_camera)), "a P of zeros")
 
 
 def test_a_damaged_image_is_refused(client, rectified_info, photo):
     client.send_camera_info(rectified_info)
-    client.send_prior(prior_of(photo.T_map_camera_prior))
+    client.send_prior(pose_stamped(photo.T_map_camera_prior))
     diagnostic = client.attempt(CompressedImage(format="jpeg", data=b"\xff\xd8\xff no picture"))
     assert diagnostic.values["status"] == "refused"
     assert "damaged" in diagnostic.reason
@@ -73,9 +58,9 @@ def test_the_priors_covariance_says_where_to_search(client, room_camera, rectifi
     client.send_camera_info(rectified_info)
     away = photo.T_map_camera @ make_pose(so3_exp(np.radians([0.0, 100.0, 0.0])), np.zeros(3))
     image = compressed_image(room_camera.undistort_image(photo.image), "png")
-    client.send_prior(with_covariance(away, np.diag([1e-4] * 3 + [1e-4] * 3)))
+    client.send_prior(pose_with_covariance(away, np.diag([1e-4] * 3 + [1e-4] * 3)))
     assert client.attempt(image).values["status"] in ("failed", "rejected")
-    client.send_prior(with_covariance(away, np.diag([0.01] * 3 + [1.0] * 3)))
+    client.send_prior(pose_with_covariance(away, np.diag([0.01] * 3 + [1.0] * 3)))
     diagnostic = client.attempt(image)
     assert diagnostic.ok, diagnostic
     assert int(diagnostic.values["views"]) > 0
@@ -85,5 +70,5 @@ def test_the_priors_covariance_says_where_to_search(client, room_camera, rectifi
 @pytest.mark.parametrize("value", [float("nan"), -1.0])
 def test_a_covariance_that_is_none_is_refused(client, photo, value):
     covariance = np.diag([value] * 6)
-    message = with_covariance(photo.T_map_camera, covariance)
+    message = pose_with_covariance(photo.T_map_camera, covariance)
     client.until_refused(lambda: client.send_prior(message), "prior has covariance")

@@ -14,15 +14,14 @@ from node_harness import (
     assert_close,
     assert_start_fails,
     connected_client,
-    executable,
-    info_of,
     node_arguments,
-    prior_of,
-    rgb_image,
     running_localizer,
 )
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Image
+
+from gsfeatloc_ros.client.messages import camera_info_of, pose_stamped, rgb_image
+from gsfeatloc_ros.client.process import executable
 
 
 def test_service_says_what_is_missing(room_map_file):
@@ -38,8 +37,8 @@ def test_answers_from_renders_at_half_the_size(room_map_file, room_camera, room_
     parameters = {"matcher__name": "sift", "renderer__resolution_scale": 0.5, "renderer__sh_degree": 0}
     with running_localizer(map__path=room_map_file, **parameters) as process, connected_client() as client:
         photo = room_photos[0]
-        client.send_camera_info(info_of(room_camera))
-        client.send_prior(prior_of(photo.T_map_camera_prior))
+        client.send_camera_info(camera_info_of(room_camera))
+        client.send_prior(pose_stamped(photo.T_map_camera_prior))
         message = rgb_image(photo.image)
         answer = client.attempt(message)
         assert answer.ok, f"{answer.reason}\n{process.output}"
@@ -55,8 +54,8 @@ def test_signal_while_idle_ends_it_cleanly(room_map_file, number):
 def test_signal_while_busy_answers_the_requests_first(room_map_file, room_camera, room_photos):
     with running_localizer(map__path=room_map_file, matcher__name="sift") as process, connected_client() as client:
         photo = room_photos[0]
-        client.send_camera_info(info_of(room_camera))
-        client.send_prior(prior_of(photo.T_map_camera_prior))
+        client.send_camera_info(camera_info_of(room_camera))
+        client.send_prior(pose_stamped(photo.T_map_camera_prior))
         assert client.attempt(rgb_image(photo.image)).ok
         requests = [client.send_request() for _ in range(3)]
         client.spin(0.2)
@@ -124,8 +123,8 @@ def test_a_lifecycle_manager_drives_it(room_map_file, room_camera, room_photos):
             assert "not active" in answer.message
             assert change(client, Transition.TRANSITION_ACTIVATE)
             client.connect()
-            client.send_camera_info(info_of(room_camera))
-            client.send_prior(prior_of(photo.T_map_camera_prior))
+            client.send_camera_info(camera_info_of(room_camera))
+            client.send_prior(pose_stamped(photo.T_map_camera_prior))
             image = rgb_image(photo.image)
             assert client.attempt(image).ok
             assert_close(client.pose_of(image), photo.T_map_camera)

@@ -17,22 +17,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 from malformed import ARRIVAL, assert_refused, camera_infos, examples, images, not_finite, poses, stamps, words
 from nav_msgs.msg import Odometry
-from node_harness import (
-    SILENCE,
-    Client,
-    Diagnostic,
-    assert_answer,
-    assert_close,
-    connected_client,
-    info_of,
-    prior_of,
-    rgb_image,
-    running_localizer,
-    send_inputs,
-    text,
-)
+from node_harness import SILENCE, Client, assert_answer, assert_close, connected_client, running_localizer, send_inputs
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import CameraInfo, Image
+
+from gsfeatloc_ros.client.messages import (
+    Diagnostic,
+    camera_info_of,
+    pose_stamped,
+    pose_with_covariance,
+    rgb_image,
+    stamp_of,
+)
+from gsfeatloc_ros.common.geometry import make_pose
 
 # Few views, so that a prior that leads nowhere is soon given up; the base is the camera, so that no tf is needed.
 PARAMETERS = {"matcher__name": "sift", "localizer__max_views": 4, "base_frame": "camera_optical", "track": "true"}
@@ -98,7 +95,7 @@ def test_camera_infos(good, room_camera):
 )
 def test_priors(good, photo, topic, message_type, name):
     @examples(25)
-    @given(poses(prior_of(photo.T_map_camera_prior), message_type, name))
+    @given(poses(pose_stamped(photo.T_map_camera_prior), message_type, name))
     def check(case):
         assert_refused(good, topic, *case)
 
@@ -169,7 +166,7 @@ def assert_no_pose_came(client: Client, before: set[str]) -> None:
 def test_cameras_of_absurd_values(good, room_camera, photo):
     before = set(good.poses)
     for changes in ABSURD_CAMERAS:
-        info = info_of(room_camera)
+        info = camera_info_of(room_camera)
         for name, value in changes.items():
             setattr(info, name, value)
         good.send_camera_info(info)
@@ -180,25 +177,16 @@ def test_cameras_of_absurd_values(good, room_camera, photo):
 def test_tiny_images(good, room_camera):
     before = set(good.poses)
     for width, height in ((1, 1), (2, 1), (1, 200), (8, 8), (3, 2000)):
-        good.send_camera_info(info_of(room_camera.scaled(width, height)))
+        good.send_camera_info(camera_info_of(room_camera.scaled(width, height)))
         image = rgb_image(np.random.default_rng(0).integers(0, 256, (height, width, 3), np.uint8))
         attempt_without_pose(good, image, (width, height))
     assert_no_pose_came(good, before)
 
 
-def at(position: list[float], covariance: np.ndarray | None = None) -> PoseWithCovarianceStamped:
-    message = PoseWithCovarianceStamped()
-    message.header.frame_id = "map"
-    message.pose.pose.position.x, message.pose.pose.position.y, message.pose.pose.position.z = position
-    if covariance is not None:
-        message.pose.covariance = np.ravel(covariance).tolist()
-    return message
-
-
 def test_priors_of_absurd_places(good, photo):
     before = set(good.poses)
     for far in (1e4, 1e9, 1e20, 1e38, 1e200, 1e308):
-        good.send_prior(at([-far, far, -far]))
+        good.send_prior(pose_with_covariance(make_pose(np.eye(3), [-far, far, -far])))
         attempt_without_pose(good, rgb_image(photo.image), far)
     assert_no_pose_came(good, before)
 
@@ -207,16 +195,14 @@ def test_priors_of_absurd_places(good, photo):
 def test_priors_of_absurd_covariances(good, photo, topic):
     """The place is right: there is the right answer, or none."""
     for name, covariance in ABSURD_COVARIANCES.items():
-        message = at([0.0, 0.0, 0.0], covariance)
-        message.pose.pose = prior_of(photo.T_map_camera_prior).pose
-        good.publish(topic, message)
+        good.publish(topic, pose_with_covariance(photo.T_map_camera_prior, covariance))
         image = rgb_image(photo.image)
         diagnostic = good.attempt(image)
         assert diagnostic.values["status"] in ("localized", "refused", "failed", "rejected"), (name, diagnostic)
         if diagnostic.ok:
             assert_close(good.pose_of(image), photo.T_map_camera)
         else:
-            assert text(image) not in good.poses, name
+            assert stamp_of(image) not in good.poses, name
 
 
 def test_impossible_correlations_do_not_open_the_gate(good, photo):
@@ -225,31 +211,25 @@ def test_impossible_correlations_do_not_open_the_gate(good, photo):
     T_map_camera_prior[:3, 3] -= 0.7 * T_map_camera_prior[:3, 2]
     before = set(good.poses)
     for correlation in (0.0, 1e4, 1e6):
-        message = at([0.0, 0.0, 0.0], 1e-6 * ((1.0 - correlation) * np.eye(6) + correlation * np.ones((6, 6))))
-        message.pose.pose = prior_of(T_map_camera_prior).pose
-        good.send_prior(message)
+        covariance = 1e-6 * ((1.0 - correlation) * np.eye(6) + correlation * np.ones((6, 6)))
+        good.send_prior(pose_with_covariance(T_map_camera_prior, covariance))
         diagnostic = attempt_without_pose(good, rgb_image(photo.image), correlation)
         assert correlation or "standard deviations from the prior" in diagnostic.reason
     assert_no_pose_came(good, before)
 
 
-def attempt_as_stamped(client: Client, image: Image) -> Diagnostic:
-    """Send an image with the stamp that it has until the localizer has said something on it."""
-    return client.until_diagnosed(lambda: client.send_image(image), lambda d: d.values.get("stamp") == text(image))
-
-
 def test_stamps_of_no_time(good, photo):
     """The prior has none, so that it holds at any time."""
     for sec, nanosec in ((-1, 0), (-(2**31), 2**32 - 1), (2**31 - 1, 2**32 - 1), (5, 2**32 - 1), (0, 0)):
-        good.send_prior(prior_of(photo.T_map_camera_prior))
+        good.send_prior(pose_stamped(photo.T_map_camera_prior))
         image = rgb_image(photo.image)
         image.header.stamp = Time(sec=sec, nanosec=nanosec)
-        diagnostic = attempt_as_stamped(good, image)
+        diagnostic = good.attempt_as_stamped(image)
         if diagnostic.ok:
             assert_close(good.pose_of(image), photo.T_map_camera)
         else:
             assert diagnostic.values["status"] == "refused", diagnostic
-            assert text(image) not in good.poses
+            assert stamp_of(image) not in good.poses
 
 
 # Bytes that are no message
@@ -298,7 +278,7 @@ def test_bytes_that_are_no_message(good, topic, message):
 
 def test_requests_to_localize_an_image(good, room_camera, photo):
     """The camera and the prior of the topics are good: what is wrong is the request's alone."""
-    prior = prior_of(photo.T_map_camera_prior)
+    prior = pose_stamped(photo.T_map_camera_prior)
 
     def check(request: LocalizeImage.Request, says: str) -> None:
         response = good.call(LocalizeImage, "localizer/localize_image", request)
@@ -313,7 +293,7 @@ def test_requests_to_localize_an_image(good, room_camera, photo):
     def check_image(case):
         image, says = case
         if "camera_info is for" not in says:
-            check(LocalizeImage.Request(image=image, camera_info=info_of(room_camera)), says)
+            check(LocalizeImage.Request(image=image, camera_info=camera_info_of(room_camera)), says)
 
     @examples(10)
     @given(camera_infos(room_camera))
@@ -327,7 +307,10 @@ def test_requests_to_localize_an_image(good, room_camera, photo):
         message, says = case
         image = rgb_image(photo.image)
         image.header.stamp = Time(sec=1)
-        check(LocalizeImage.Request(image=image, camera_info=info_of(room_camera), has_prior=True, prior=message), says)
+        check(
+            LocalizeImage.Request(image=image, camera_info=camera_info_of(room_camera), has_prior=True, prior=message),
+            says,
+        )
 
     check_image()
     check_camera()

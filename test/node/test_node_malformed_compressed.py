@@ -9,15 +9,10 @@ from pathlib import Path
 import cv2
 from hypothesis import given
 from malformed import assert_refused, compressed_images, examples, png
-from node_harness import (
-    NodeProcess,
-    assert_close,
-    connected_client,
-    info_of,
-    prior_of,
-    running_localizer,
-)
+from node_harness import NodeProcess, assert_close, connected_client, running_localizer
 from sensor_msgs.msg import CompressedImage
+
+from gsfeatloc_ros.client.messages import camera_info_of, pose_stamped
 
 PARAMETERS = {"image__transport": "compressed", "matcher__name": "sift", "localizer__max_views": 4}
 
@@ -35,8 +30,8 @@ def test_compressed_images(room_map_file, room_camera, room_photos):
         running_localizer(map__path=room_map_file, **PARAMETERS) as localizer,
         connected_client(transport="compressed") as client,
     ):
-        client.send_camera_info(info_of(room_camera))
-        client.send_prior(prior_of(photo.T_map_camera_prior))
+        client.send_camera_info(camera_info_of(room_camera))
+        client.send_prior(pose_stamped(photo.T_map_camera_prior))
 
         def assert_good_one_is_answered() -> None:
             image = CompressedImage(format="jpeg", data=encoded)

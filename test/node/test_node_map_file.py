@@ -19,13 +19,11 @@ from node_harness import (
     assert_answer,
     assert_close,
     connected_client,
-    prior_of,
-    rgb_image,
     running_localizer,
     send_inputs,
-    text,
 )
 
+from gsfeatloc_ros.client.messages import pose_stamped, rgb_image, stamp_of
 from gsfeatloc_ros.maps import GaussianMap
 from gsfeatloc_ros.maps.ply import write_ply
 from gsfeatloc_ros.render.cache import SUFFIX
@@ -82,7 +80,7 @@ def send_image(client: Client, photo) -> str:
     image = rgb_image(photo.image)
     image.header.stamp = client.next_stamp()
     client.send_image(image)
-    return text(image)
+    return stamp_of(image)
 
 
 def moved(pose: np.ndarray) -> np.ndarray:
@@ -209,7 +207,7 @@ def test_another_map_serves_once_it_is_loaded(client, map_file, room_map_file, m
     image = rgb_image(photo.image)
     assert not client.attempt(image).ok
     assert client.pose_of(image) is None
-    client.send_prior(prior_of(moved(photo.T_map_camera_prior)))
+    client.send_prior(pose_stamped(moved(photo.T_map_camera_prior)))
     image = rgb_image(photo.image)
     assert client.attempt(image).ok
     assert_close(client.pose_of(image), moved(photo.T_map_camera))
@@ -217,5 +215,5 @@ def test_another_map_serves_once_it_is_loaded(client, map_file, room_map_file, m
     seen = len(client.maps)
     assert client.set_parameter("map.path", str(map_file)).successful
     assert client.spin_until(lambda: len(client.maps) > seen, TIMEOUT)
-    client.send_prior(prior_of(photo.T_map_camera_prior))
+    client.send_prior(pose_stamped(photo.T_map_camera_prior))
     assert_answer(client, photo)

@@ -6,16 +6,9 @@ import json
 
 import numpy as np
 import pytest
-from node_harness import (
-    assert_start_fails,
-    connected_client,
-    info_of,
-    matrix_of,
-    prior_of,
-    rgb_image,
-    running_localizer,
-)
+from node_harness import assert_start_fails, connected_client, running_localizer
 
+from gsfeatloc_ros.client.messages import camera_info_of, pose_matrix, pose_stamped, rgb_image
 from gsfeatloc_ros.common.geometry import quaternion_from_matrix, rotation_error_deg, so3_exp, translation_error
 from gsfeatloc_ros.maps import Similarity
 from gsfeatloc_ros.node.parameters import PARAMETERS, map_alignment
@@ -70,13 +63,13 @@ def test_answers_are_in_the_frame_of_the_robot(room_map_file, room_camera, room_
         "localizer__prior_translation": 1.25,
     }
     with running_localizer(**parameters) as process, connected_client() as client:
-        client.send_camera_info(info_of(room_camera))
+        client.send_camera_info(camera_info_of(room_camera))
         for photo in room_photos[:2]:
-            client.send_prior(prior_of(ALIGNMENT.transform_pose(photo.T_map_camera_prior)))
+            client.send_prior(pose_stamped(ALIGNMENT.transform_pose(photo.T_map_camera_prior)))
             message = rgb_image(photo.image)
             answer = client.attempt(message)
             assert answer.ok, f"{answer.reason}\n{process.output}"
-            pose, truth = matrix_of(client.pose_of(message)), ALIGNMENT.transform_pose(photo.T_map_camera)
+            pose, truth = pose_matrix(client.pose_of(message)), ALIGNMENT.transform_pose(photo.T_map_camera)
             assert rotation_error_deg(pose, truth) < 1.0
             assert translation_error(pose, truth) < 0.02 * ALIGNMENT.scale
 

@@ -4,32 +4,24 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from geometry_msgs.msg import PoseWithCovarianceStamped
-from node_harness import (
-    TIMEOUT,
-    assert_close,
-    connected_client,
-    info_of,
-    prior_of,
-    rgb_image,
-    text,
-)
+from node_harness import TIMEOUT, assert_close, connected_client
 from rcl_interfaces.srv import DescribeParameters
 from sensor_msgs.msg import Image
-from std_msgs.msg import Header
+
+from gsfeatloc_ros.client.messages import camera_info_of, pose_stamped, pose_with_covariance, rgb_image, stamp_of
 
 
 @pytest.fixture
 def client(localizer, room_camera):
     with connected_client() as client:
-        client.send_camera_info(info_of(room_camera))
+        client.send_camera_info(camera_info_of(room_camera))
         yield client
         for name, value in {"mode": "continuous", "max_rate": 0.0}.items():
             assert client.set_parameter(name, value).successful
 
 
 def test_on_request_only_services_localize(client, photo):
-    client.send_prior(prior_of(photo.T_map_camera_prior))
+    client.send_prior(pose_stamped(photo.T_map_camera_prior))
     assert client.set_parameter("mode", "on_request").successful
     image = client.send_once(photo.image)
     assert not client.is_tried(image)
@@ -40,17 +32,17 @@ def test_on_request_only_services_localize(client, photo):
 
 def test_on_prior_one_image_for_each(client, photo):
     assert client.set_parameter("mode", "on_prior").successful
-    client.send_prior(prior_of(photo.T_map_camera_prior))
+    client.send_prior(pose_stamped(photo.T_map_camera_prior))
     for _ in range(2):
         image = client.send_once(photo.image)
         assert client.is_tried(image, TIMEOUT)
         assert_close(client.pose_of(image), photo.T_map_camera)
         assert not client.is_tried(client.send_once(photo.image), 1.0)
-        client.send_prior(prior_of(photo.T_map_camera_prior))
+        client.send_prior(pose_stamped(photo.T_map_camera_prior))
 
 
 def test_no_more_images_a_second_than_allowed(client, photo):
-    client.send_prior(prior_of(photo.T_map_camera_prior))
+    client.send_prior(pose_stamped(photo.T_map_camera_prior))
     assert client.set_parameter("max_rate", 0.25).successful
     # Stamps are a second apart: of eight images two are tried.
     images = []
@@ -80,7 +72,7 @@ def test_parameters_that_cannot_be_set_stay_as_they_are(client, name, value, say
 
 
 def test_options_of_the_localizer_change_while_it_runs(client, photo):
-    client.send_prior(prior_of(photo.T_map_camera_prior))
+    client.send_prior(pose_stamped(photo.T_map_camera_prior))
     assert client.set_parameter("localizer.min_inliers", 5000).successful
     refused = client.attempt(rgb_image(photo.image))
     assert refused.values["status"] == "rejected"
@@ -98,7 +90,7 @@ def test_descriptions_say_which_parameters_can_be_set(client):
 
 
 def test_health_says_how_it_goes(client, room_map_file, photo):
-    client.send_prior(prior_of(photo.T_map_camera_prior))
+    client.send_prior(pose_stamped(photo.T_map_camera_prior))
     assert client.attempt(rgb_image(photo.image)).ok
     seen = len(client.health)
     assert client.spin_until(lambda: len(client.health) > seen)
@@ -115,12 +107,12 @@ def test_health_says_how_it_goes(client, room_map_file, photo):
 
 def test_debug_image_shows_photo_and_render_and_is_drawn_for_refused_ones_too(client, room_camera, photo):
     pictures = client.listen(Image, "debug_image")
-    client.send_prior(prior_of(photo.T_map_camera_prior))
-    for info in (info_of(room_camera), info_of(room_camera.scaled(320, 240))):
+    client.send_prior(pose_stamped(photo.T_map_camera_prior))
+    for info in (camera_info_of(room_camera), camera_info_of(room_camera.scaled(320, 240))):
         client.send_camera_info(info)
         image = rgb_image(photo.image)
         client.attempt(image)
-        assert client.spin_until(lambda image=image: any(text(picture) == text(image) for picture in pictures))
+        assert client.spin_until(lambda image=image: any(stamp_of(picture) == stamp_of(image) for picture in pictures))
         picture = pictures[-1]
         pixels = np.frombuffer(picture.data, np.uint8).reshape(picture.height, picture.width, 3)
         assert picture.width == 1280
@@ -129,12 +121,10 @@ def test_debug_image_shows_photo_and_render_and_is_drawn_for_refused_ones_too(cl
 
 
 def test_initialpose_needs_tf(client, photo):
-    message = PoseWithCovarianceStamped(header=Header(frame_id="map"))
-    message.pose.pose = prior_of(photo.T_map_camera_prior).pose
-    client.publish("initialpose", message)
+    client.publish("initialpose", pose_with_covariance(photo.T_map_camera_prior))
     refused = client.attempt(rgb_image(photo.image))
     assert refused.values["status"] == "refused"
     assert "tf" in refused.reason
     assert not client.relocalize().success
-    client.send_prior(prior_of(photo.T_map_camera_prior))
+    client.send_prior(pose_stamped(photo.T_map_camera_prior))
     assert client.attempt(rgb_image(photo.image)).ok

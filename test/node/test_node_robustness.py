@@ -20,11 +20,12 @@ from node_harness import (
     assert_close,
     assert_no_answer,
     connected_client,
-    prior_of,
     running_localizer,
     send_inputs,
     stamped,
 )
+
+from gsfeatloc_ros.client.messages import pose_stamped, rgb_image
 
 # A signal in the middle of a localization may take so long to end the node, in seconds, on a slow machine.
 END_TIMEOUT = 8.0
@@ -104,33 +105,41 @@ def test_publisher_is_killed_and_another_one_starts(client, room_camera, photo, 
 
 @pytest.mark.parametrize("jump", [[100.0, 0.0, 0.0], [0.0, -100.0, 0.0], [0.0, 0.0, 100.0]])
 def test_prior_jumps_100_m(client, room_camera, photo, jump):
+    image = rgb_image(photo.image)
     send_inputs(client, room_camera, photo)
     assert_answer(client, photo)
     far = photo.T_map_camera_prior.copy()
     far[:3, 3] += jump
-    client.send_prior(prior_of(far))
-    assert_no_answer(client, photo, "photo and renders at the prior and in .* have nothing in common|not believed")
-    client.send_prior(prior_of(photo.T_map_camera_prior))
+    client.send_prior(pose_stamped(far))
+    assert_no_answer(client, image, "photo and renders at the prior and in .* have nothing in common|not believed")
+    client.send_prior(pose_stamped(photo.T_map_camera_prior))
     assert_answer(client, photo)
 
 
 def test_prior_stale_or_of_the_future(client, room_camera, photo):
+    image = rgb_image(photo.image)
     send_inputs(client, room_camera, photo)
-    client.send_prior(stamped(prior_of(photo.T_map_camera_prior), 100_000))
+    client.send_prior(stamped(pose_stamped(photo.T_map_camera_prior), 100_000))
     assert_answer(client, photo, 100_009)
-    assert_no_answer(client, photo, r"prior is 11\.0 s older than the image .*prior_max_age.*send a newer one", 100_011)
-    assert_no_answer(client, photo, r"prior is 11\.0 s newer than the image .*prior_max_age.*clocks", 99_989)
+    assert_no_answer(
+        client,
+        image,
+        r"prior is 11\.0 s older than the image .*prior_max_age.*send a newer one",
+        100_011,
+    )
+    assert_no_answer(client, image, r"prior is 11\.0 s newer than the image .*prior_max_age.*clocks", 99_989)
     assert_answer(client, photo, 99_991)
 
 
 def test_stamps_go_back(client, room_camera, photo):
+    image = rgb_image(photo.image)
     send_inputs(client, room_camera, photo)
-    prior = prior_of(photo.T_map_camera_prior)
+    prior = pose_stamped(photo.T_map_camera_prior)
     client.send_prior(stamped(prior, 200_100))
     assert_answer(client, photo, 200_100)
-    assert_no_answer(client, photo, r"prior is 100\.0 s newer than the image .*prior_max_age", 200_000)
+    assert_no_answer(client, image, r"prior is 100\.0 s newer than the image .*prior_max_age", 200_000)
     client.send_prior(stamped(prior, 200_000))
     assert_answer(client, photo, 200_000)
     # Late, and out of order.
     client.send_prior(stamped(prior, 199_900))
-    assert_no_answer(client, photo, r"prior is 101\.0 s older than the image .*prior_max_age", 200_001)
+    assert_no_answer(client, image, r"prior is 101\.0 s older than the image .*prior_max_age", 200_001)

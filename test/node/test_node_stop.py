@@ -6,19 +6,10 @@ import signal
 
 import numpy as np
 import rclpy
-from geometry_msgs.msg import PoseWithCovarianceStamped
 from lifecycle_msgs.srv import ChangeState, GetState
-from node_harness import (
-    TIMEOUT,
-    Client,
-    assert_answer,
-    connected_client,
-    info_of,
-    prior_of,
-    rgb_image,
-    running_localizer,
-    send_inputs,
-)
+from node_harness import TIMEOUT, Client, assert_answer, connected_client, running_localizer, send_inputs
+
+from gsfeatloc_ros.client.messages import camera_info_of, pose_with_covariance, rgb_image
 
 # A signal in the middle of a localization may take so long to end the node, in seconds, on a slow machine.
 END_TIMEOUT = 8.0
@@ -36,10 +27,8 @@ def test_signal_in_the_middle_of_a_localization(room_map_file, room_camera, room
     photo = room_photos[0]
     parameters = {"map__path": room_map_file, "matcher__name": "sift", "localizer__max_views": 1000}
     with running_localizer(**parameters) as localizer, connected_client() as client:
-        client.send_camera_info(info_of(room_camera))
-        wide = PoseWithCovarianceStamped(header=prior_of(photo.T_map_camera).header)
-        wide.pose.pose = prior_of(photo.T_map_camera).pose
-        wide.pose.covariance = np.diag([1.0, 1.0, 1.0, 10.0, 10.0, 10.0]).ravel().tolist()
+        client.send_camera_info(camera_info_of(room_camera))
+        wide = pose_with_covariance(photo.T_map_camera, np.diag([1.0, 1.0, 1.0, 10.0, 10.0, 10.0]))
         client.send_prior(wide)
         mirrored = rgb_image(np.ascontiguousarray(photo.image[:, ::-1]))
         mirrored.header.stamp = client.next_stamp()

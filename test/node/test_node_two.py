@@ -9,22 +9,13 @@ import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
-from node_harness import (
-    RESEND_PERIOD,
-    START_TIMEOUT,
-    TIMEOUT,
-    NodeProcess,
-    SpunNode,
-    info_of,
-    matrix_of,
-    node_arguments,
-    prior_of,
-    rgb_image,
-    text,
-)
+from node_harness import RESEND_PERIOD, TIMEOUT, NodeProcess, node_arguments
 from sensor_msgs.msg import CameraInfo, Image
 from std_srvs.srv import Trigger
 
+from gsfeatloc_ros.client.client_node import ClientNode
+from gsfeatloc_ros.client.messages import camera_info_of, pose_matrix, pose_stamped, rgb_image, stamp_of
+from gsfeatloc_ros.client.process import START_TIMEOUT
 from gsfeatloc_ros.common.geometry import quaternion_from_matrix, rotation_error_deg, so3_exp, translation_error
 from gsfeatloc_ros.maps import Similarity
 
@@ -49,7 +40,7 @@ def localizer(name: str, map_file: Path) -> NodeProcess:
     return NodeProcess(*node_arguments(**parameters), "-r", f"__ns:=/{name}")
 
 
-class Robots(SpunNode):
+class Robots(ClientNode):
     """The robots of both namespaces, and what the localizers say to them."""
 
     def __init__(self) -> None:
@@ -70,7 +61,7 @@ class Robots(SpunNode):
             node.create_subscription(
                 PoseWithCovarianceStamped,
                 f"/{name}/pose",
-                lambda message, name=name: self.poses[name].update({text(message): message}),
+                lambda message, name=name: self.poses[name].update({stamp_of(message): message}),
                 10,
             )
 
@@ -93,16 +84,16 @@ class Robots(SpunNode):
         """Send an image until the localizer has said something on it, and return what: its status."""
         statuses = self.statuses.setdefault(f"{name}/localizer: localization", {})
         deadline = time.monotonic() + TIMEOUT
-        while text(image) not in statuses and time.monotonic() < deadline:
+        while stamp_of(image) not in statuses and time.monotonic() < deadline:
             self.send(name, "image", image)
             # Best effort may lose an image.
-            self.spin_until(lambda: text(image) in statuses, RESEND_PERIOD)
-        return statuses[text(image)]
+            self.spin_until(lambda: stamp_of(image) in statuses, RESEND_PERIOD)
+        return statuses[stamp_of(image)]
 
     def pose(self, name: str, image: Image) -> PoseWithCovarianceStamped:
         """The answer to an image."""
-        assert self.spin_until(lambda: text(image) in self.poses[name]), f"no pose from {name}: {self.statuses}"
-        return self.poses[name][text(image)]
+        assert self.spin_until(lambda: stamp_of(image) in self.poses[name]), f"no pose from {name}: {self.statuses}"
+        return self.poses[name][stamp_of(image)]
 
     def relocalize(self, name: str) -> Trigger.Response:
         future = self._services[name].call_async(Trigger.Request())
@@ -140,9 +131,9 @@ def robots(localizers):
 
 
 def send_inputs(robots: Robots, name: str, camera, photo) -> None:
-    robots.send(name, "camera_info", info_of(camera))
+    robots.send(name, "camera_info", camera_info_of(camera))
     prior = ALIGNMENTS[name].transform_pose(photo.T_map_camera_prior)
-    robots.send(name, "prior", prior_of(prior, f"map_{name}"))
+    robots.send(name, "prior", pose_stamped(prior, f"map_{name}"))
     robots.spin(0.3)
 
 
@@ -156,8 +147,8 @@ def assert_right(pose: PoseWithCovarianceStamped, name: str, photo) -> None:
     alignment = ALIGNMENTS[name]
     truth = alignment.transform_pose(photo.T_map_camera)
     assert pose.header.frame_id == f"map_{name}"
-    assert rotation_error_deg(matrix_of(pose), truth) < 1.0
-    assert translation_error(matrix_of(pose), truth) < 0.02 * alignment.scale
+    assert rotation_error_deg(pose_matrix(pose), truth) < 1.0
+    assert translation_error(pose_matrix(pose), truth) < 0.02 * alignment.scale
 
 
 def test_each_answers_its_own_images_from_its_own_map(robots, room_camera, room_photos):
@@ -174,8 +165,8 @@ def test_each_answers_its_own_images_from_its_own_map(robots, room_camera, room_
     parts = ("localization", "health")
     assert set(robots.statuses) == {f"{name}/localizer: {part}" for name in ALIGNMENTS for part in parts}
     for name, other in ("ab", "ba"):
-        assert text(images[name]) not in robots.poses[other]
-        assert text(images[name]) not in robots.statuses[f"{other}/localizer: localization"]
+        assert stamp_of(images[name]) not in robots.poses[other]
+        assert stamp_of(images[name]) not in robots.statuses[f"{other}/localizer: localization"]
 
 
 def test_each_service_is_of_its_own_localizer(robots, room_camera, room_photos):
@@ -187,13 +178,13 @@ def test_each_service_is_of_its_own_localizer(robots, room_camera, room_photos):
     robots.poses["b"].clear()
     assert robots.relocalize("b").success
     assert_right(robots.pose("b", image), "b", photo)
-    assert text(image) not in robots.poses["a"]
+    assert stamp_of(image) not in robots.poses["a"]
 
 
 def test_a_prior_in_the_frame_of_the_other_map_is_refused(robots, room_camera, room_photos):
     photo = room_photos[3]
     send_inputs(robots, "a", room_camera, photo)
-    robots.send("a", "prior", prior_of(photo.T_map_camera_prior, "map_b"))
+    robots.send("a", "prior", pose_stamped(photo.T_map_camera_prior, "map_b"))
     robots.spin(0.3)
     assert robots.send_image("a", image_of(photo, 300)) == "refused"
     answer = robots.relocalize("a")

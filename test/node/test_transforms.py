@@ -17,8 +17,9 @@ from hypothesis import strategies as st
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from rclpy.time import Time
+from transforms import transform_stamped
 
-from gsfeatloc_ros.common.geometry import invert, make_pose, quaternion_from_matrix, so3_exp
+from gsfeatloc_ros.common.geometry import invert, make_pose, so3_exp
 from gsfeatloc_ros.node.transforms import TransformError, Transforms
 
 # Last: a tf2_ros that is installed comes before it.
@@ -36,15 +37,6 @@ def turn(angle: float, translation: tuple[float, float, float]) -> np.ndarray:
 
 def random_pose(rng: np.random.Generator) -> np.ndarray:
     return make_pose(so3_exp(rng.normal(size=3)), rng.normal(size=3))
-
-
-def stamped(parent: str, child: str, pose: np.ndarray, stamp: int) -> TransformStamped:
-    message = TransformStamped(child_frame_id=child)
-    message.header.frame_id, message.header.stamp = parent, Time(nanoseconds=stamp).to_msg()
-    translation, rotation = message.transform.translation, message.transform.rotation
-    translation.x, translation.y, translation.z = pose[:3, 3].tolist()
-    rotation.x, rotation.y, rotation.z, rotation.w = quaternion_from_matrix(pose[:3, :3]).tolist()
-    return message
 
 
 class Robot:
@@ -71,10 +63,10 @@ class Robot:
         wait_for(lambda: all_heard(self._teller))
 
     def tell(self, parent: str, child: str, pose: np.ndarray, stamp: int) -> None:
-        self._moving.sendTransform(stamped(parent, child, pose, stamp))
+        self._moving.sendTransform(transform_stamped(parent, child, pose, Time(nanoseconds=stamp).to_msg()))
 
     def tell_static(self, parent: str, child: str, pose: np.ndarray) -> None:
-        self._static.sendTransform(stamped(parent, child, pose, 0))
+        self._static.sendTransform(transform_stamped(parent, child, pose, Time().to_msg()))
 
     def close(self) -> None:
         self._closing.set()
@@ -281,9 +273,9 @@ def test_any_tree_gives_what_the_chain_of_its_poses_gives(parents, seed, data):
         pose = random_pose(rng)
         T_root.append(T_root[parent] @ pose)
         if rng.random() < 0.5:
-            buffer.set_transform_static(stamped(f"f{parent}", f"f{child}", pose, 0), "test")
+            buffer.set_transform_static(transform_stamped(f"f{parent}", f"f{child}", pose, Time().to_msg()), "test")
         else:
-            buffer.set_transform(stamped(f"f{parent}", f"f{child}", pose, 3 * SECOND), "test")
+            buffer.set_transform(transform_stamped(f"f{parent}", f"f{child}", pose, Time(seconds=3).to_msg()), "test")
     target, source = (data.draw(st.integers(0, len(parents))) for _ in range(2))
     for stamp in (0, 3 * SECOND):
         found = buffer.lookup_transform(f"f{target}", f"f{source}", Time(nanoseconds=stamp))
@@ -315,7 +307,7 @@ def test_a_quaternion_of_another_length_is_normalised():
 
 
 def rotated(parent: str, child: str, rotation: tuple[float, float, float, float]) -> TransformStamped:
-    message = stamped(parent, child, np.eye(4), SECOND)
+    message = transform_stamped(parent, child, np.eye(4), Time(seconds=1).to_msg())
     into = message.transform.rotation
     into.x, into.y, into.z, into.w = rotation
     return message

@@ -7,8 +7,9 @@ import time
 
 import numpy as np
 import rclpy
-from node_harness import rgb_image
 from sensor_msgs.msg import Image
+
+from gsfeatloc_ros.client.messages import rgb_image
 
 
 def main() -> None:

@@ -15,10 +15,12 @@ from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseStamped
 from hypothesis import HealthCheck, Phase, settings
 from hypothesis import strategies as st
-from node_harness import Client, info_of, text
+from node_harness import Client
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_msgs.msg import Header
 
+from gsfeatloc_ros.client.messages import camera_info_of, stamp_of
+from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.ros_io.decode import ENCODINGS, MAX_SIDE
 
 # How long a message takes to arrive, in seconds. If it took longer, it is sent again.
@@ -51,7 +53,7 @@ def assert_refused(client: Client, topic: str, message: Any, says: str) -> None:
         answers.append(answer.message)
     else:
         raise AssertionError(f"no refusal that says {says!r} but {set(answers)} to {message}")
-    assert text(message) not in client.poses
+    assert stamp_of(message) not in client.poses
 
 
 not_finite = st.sampled_from([math.nan, math.inf, -math.inf])
@@ -107,9 +109,9 @@ def images(draw) -> tuple[Image, str]:
 
 
 @st.composite
-def camera_infos(draw, good: CameraInfo) -> tuple[CameraInfo, str]:
+def camera_infos(draw, camera: Camera) -> tuple[CameraInfo, str]:
     """Calibrations that no camera of these images has, and the reason."""
-    info = info_of(good)
+    info = camera_info_of(camera)
     info.header.stamp, info.header.frame_id = draw(stamps), draw(words)
 
     def not_finite_k() -> str:

@@ -1,0 +1,46 @@
+"""A node for programs that wait for what a localizer says."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+
+# Seconds. Generous: machines may be slow and shared.
+TIMEOUT = 60.0
+
+
+class ClientNode:
+    """A node in a context of its own, whose messages are taken while somebody waits for something."""
+
+    def __init__(self, name: str) -> None:
+        self._context = rclpy.Context()
+        rclpy.init(context=self._context)
+        self.node = rclpy.create_node(name, context=self._context)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self.node)
+
+    def close(self) -> None:
+        """Leave the graph."""
+        self._executor.shutdown()
+        self.node.destroy_node()
+        rclpy.shutdown(context=self._context)
+
+    def spin_until(self, condition: Callable[[], bool], timeout: float = TIMEOUT) -> bool:
+        """Take messages until the condition holds; return False when it does not within `timeout` seconds."""
+        deadline = time.monotonic() + timeout
+        while not condition():
+            if time.monotonic() > deadline:
+                return False
+            self.spin_once()
+        return True
+
+    def spin_once(self) -> None:
+        """Take a message, if one comes soon."""
+        self._executor.spin_once(timeout_sec=0.05)
+
+    def spin(self, seconds: float) -> None:
+        """Take messages for so long."""
+        self.spin_until(lambda: False, seconds)
