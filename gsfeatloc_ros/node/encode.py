@@ -1,4 +1,4 @@
-"""ROS messages out of the localizer's own types. What comes in is decoded by gsfeatloc_ros/messages.py."""
+"""Encode the localizer's own types as ROS messages. What comes in is decoded by ros_io/decode.py."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from gsfeatloc_ros.common.geometry import quaternion_from_matrix
 
 
 def image_message(rgb: np.ndarray, header: Header) -> Image:
-    """Image message of encoding rgb8 from pixels (H, W, 3) uint8 RGB."""
+    """Return pixels (H, W, 3) uint8 RGB as an image message of encoding rgb8."""
     height, width = rgb.shape[:2]
     # The one way to fill Image.data without a slow check of every byte (measured: 0.4 ms for 1080p, a list 150 ms).
     data = array("B")
@@ -22,7 +22,7 @@ def image_message(rgb: np.ndarray, header: Header) -> Image:
 
 
 def pose_message(pose: np.ndarray, covariance: np.ndarray, header: Header) -> PoseWithCovarianceStamped:
-    """Pose message of a pose (4, 4) and its covariance (6, 6) in ROS order, about the axes of the header's frame."""
+    """Return a pose (4, 4) with its covariance (6, 6), in ROS order about the axes of its frame, as a message."""
     message = PoseWithCovarianceStamped(header=header)
     position, orientation = message.pose.pose.position, message.pose.pose.orientation
     position.x, position.y, position.z = pose[:3, 3].tolist()

@@ -1,4 +1,4 @@
-"""The `localizer` executable: start, spin until a signal, leave in order."""
+"""The executable `localizer`: start, spin until a signal, leave in order."""
 
 from __future__ import annotations
 
@@ -11,18 +11,21 @@ import time
 from collections.abc import Callable
 from types import FrameType
 
+from gsfeatloc_ros.common.openmp import wait_passively
+
 # Seconds that the running localization gets to end after a signal, and requests in progress to be answered.
 _STOP_TIMEOUT = 3.0
-_ANSWER_TIME = 0.5
+_ANSWER_TIMEOUT = 0.5
 # Seconds after which a process that still has not left is ended.
 _LEAVE_TIMEOUT = 10.0
-# How often spinning looks for a signal, in seconds.
+# Seconds between two looks for a signal while spinning.
 _SIGNAL_PERIOD = 0.1
 
 
 def main(args: list[str] | None = None) -> int:
     """Run the node until SIGINT or SIGTERM; return the exit status."""
-    # Before the imports below, which take seconds: a signal then must not end in a traceback.
+    # Before the imports below: they load OpenMP, and take seconds, in which a signal must not end in a traceback.
+    wait_passively()
     _on_signal(lambda number, frame: sys.exit(0))
     import rclpy
     from rclpy.exceptions import ParameterException
@@ -58,9 +61,9 @@ def main(args: list[str] | None = None) -> int:
         # The thread is in native code that the interpreter's own exit would pull away under it.
         sys.stderr.flush()
         os._exit(0)
-    if session and session.unanswered_requests:
+    if node.unanswered_requests:
         # A service cannot wait for acknowledgements: the answers get this long to be sent and to arrive.
-        deadline = time.monotonic() + _ANSWER_TIME
+        deadline = time.monotonic() + _ANSWER_TIMEOUT
         while time.monotonic() < deadline:
             executor.spin_once(timeout_sec=_SIGNAL_PERIOD)
     node.destroy_node()

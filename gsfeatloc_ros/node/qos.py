@@ -1,8 +1,9 @@
-"""Quality of service of the node's topics: parameters may override it, and what does not fit is told."""
+"""Quality of service of the node's topics: parameters may override it, and what does not fit is reported."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 from rclpy.event_handler import SubscriptionEventCallbacks
@@ -27,29 +28,37 @@ def overridable() -> QoSOverridingOptions:
     )
 
 
-def subscribe(
-    node: Node,
-    message_type: type,
-    topic: str,
-    callback: Callable[[Any], None],
-    qos: QoSProfile,
-    complain: Callable[[str], None],
-) -> Subscription:
-    """Subscribe with a QoS that can be overridden; `complain` is told of a publisher whose own does not fit."""
-    name = node.resolve_topic_name(topic)
+@dataclass(frozen=True)
+class Topic:
+    """A topic that the node listens to.
+
+    Attributes:
+        message_type: of what comes on it.
+        name: before remapping.
+        qos: that is asked for.
+    """
+
+    message_type: type
+    name: str
+    qos: QoSProfile
+
+
+def subscribe(node: Node, topic: Topic, callback: Callable[[Any], None], refuse: Callable[[str], None]) -> Subscription:
+    """Subscribe with a QoS that can be overridden; `refuse` gets the reason why that of a publisher does not fit."""
+    name = node.resolve_topic_name(topic.name)
 
     def incompatible(event: Any) -> None:
         policy = qos_policy_name_from_kind(event.last_policy_kind).lower()
-        complain(
+        refuse(
             f"a publisher on {name} offers another {policy} than is asked for, nothing comes from it: set "
             f"qos_overrides.{name}.subscription.{policy} to what it offers (ros2 topic info --verbose {name})"
         )
 
     return node.create_subscription(
-        message_type,
-        topic,
+        topic.message_type,
+        topic.name,
         callback,
-        qos,
+        topic.qos,
         event_callbacks=SubscriptionEventCallbacks(incompatible_qos=incompatible),
         qos_overriding_options=overridable(),
     )

@@ -1,9 +1,10 @@
-"""What tf knows, and what it is told. tf2_ros is imported when first needed: without tf, the localizer runs too."""
+"""Look up transforms in tf, and broadcast one. tf2_ros is imported when first needed: the localizer runs without."""
 
 from __future__ import annotations
 
 import time
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
@@ -29,8 +30,8 @@ class Transforms:
 
     def __init__(self, node: Node) -> None:
         self._node = node
-        self._buffer = None
-        self._broadcaster = None
+        self._buffer: Any = None
+        self._broadcaster: Any = None
 
     def listen(self) -> None:
         """Begin to listen to tf; nothing more happens when called again.
@@ -44,7 +45,7 @@ class Transforms:
             self._listener = tf2_ros.TransformListener(self._buffer, self._node)
 
     def lookup(self, target: str, source: str, stamp: int, timeout: float = 0.5) -> np.ndarray:
-        """Pose T_target_source (4, 4) of the frame `source` in the frame `target`.
+        """Return the pose T_target_source (4, 4) of the frame `source` in the frame `target`.
 
         What is not there yet is waited for, in seconds of the wall clock: the node's own may stand still. Not to be
         called in the executor's thread with a timeout, where nothing can come meanwhile.
@@ -77,7 +78,7 @@ class Transforms:
             time.sleep(_POLL_PERIOD)
 
     def broadcast(self, parent: str, child: str, T_parent_child: np.ndarray, stamp: Time) -> None:
-        """Tell tf the pose T_parent_child (4, 4) of the frame `child` in the frame `parent` at a time.
+        """Broadcast the pose T_parent_child (4, 4) of the frame `child` in the frame `parent` at a time.
 
         Raises:
             TransformError: tf2_ros is not installed.
@@ -108,7 +109,7 @@ def _import_tf2_ros() -> ModuleType:
 
 
 def _pose(message: TransformStamped) -> np.ndarray:
-    """Pose T_target_source (4, 4); tf refuses NaN, but not infinite values."""
+    """Return the pose T_target_source (4, 4); tf refuses NaN, but not infinite values."""
     translation, rotation = message.transform.translation, message.transform.rotation
     position = np.array([translation.x, translation.y, translation.z])
     if not np.isfinite(position).all():
@@ -116,4 +117,5 @@ def _pose(message: TransformStamped) -> np.ndarray:
             f"tf's transform from {message.child_frame_id!r} to {message.header.frame_id!r} has translation "
             f"{position.tolist()}: all must be finite"
         )
-    return make_pose(matrix_from_quaternion([rotation.x, rotation.y, rotation.z, rotation.w]), position)
+    quaternion = np.array([rotation.x, rotation.y, rotation.z, rotation.w])
+    return make_pose(matrix_from_quaternion(quaternion), position)

@@ -1,4 +1,4 @@
-"""One thread that works: on what is asked for first, and between that on the newest of what comes."""
+"""One thread that works on what is requested, and in between on the newest of what is offered."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class Worker(Generic[Item, Result]):
                 self._changed.notify()
 
     def request(self, item: Item) -> Future[Result]:
-        """Work on `item` in any case; whoever asks for the same one meanwhile shares the result.
+        """Work on `item` in any case; requests of the same one meanwhile share the result.
 
         The Future is cancelled when the worker stops before that.
         """
@@ -70,7 +70,7 @@ class Worker(Generic[Item, Result]):
                     return waiting.future
             if self._offered and self._offered.item is item:
                 self._offered = None
-            task = _Task(item)
+            task: _Task[Item, Result] = _Task(item)
             if self._stopping:
                 task.future.cancel()
                 return task.future
@@ -81,7 +81,7 @@ class Worker(Generic[Item, Result]):
         return task.future
 
     def stop(self, timeout: float) -> bool:
-        """Cancel what waits, interrupt the running work, and say whether it ended within `timeout` seconds."""
+        """Cancel what waits, interrupt the running work, and return whether it ended within `timeout` seconds."""
         with self._changed:
             self._stopping = True
             waiting, self._requested, self._offered = self._requested, deque(), None
@@ -101,10 +101,10 @@ class Worker(Generic[Item, Result]):
                 if self._stopping:
                     return
                 self._running_was_requested = bool(self._requested)
-                if self._requested:
-                    task = self._requested.popleft()
-                else:
-                    task, self._offered = self._offered, None
+                task = self._requested.popleft() if self._requested else self._offered
+                assert task is not None  # that was waited for
+                if not self._running_was_requested:
+                    self._offered = None
                 self._running = task
             try:
                 result = self._work(task.item, task.interrupted.is_set)

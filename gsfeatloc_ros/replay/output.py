@@ -33,7 +33,7 @@ def errors(image: ReplayedImage, truth: Trajectory) -> dict[str, float]:
     true_pose = None if image.stamp is None else truth.at(image.stamp)
     if true_pose is None:
         return {}
-    poses = {"": image.pose and image.pose.T_map_camera, "prior_": image.T_map_camera_prior}
+    poses = {"": None if image.pose is None else image.pose.T_map_camera, "prior_": image.T_map_camera_prior}
     values = {}
     for prefix, pose in poses.items():
         if pose is not None:

@@ -20,7 +20,7 @@ from gsfeatloc_ros.ros_io.message_types import (
     CompressedImage,
     Image,
     Odometry,
-    Pose,
+    PoseWithCovariance,
     Time,
 )
 
@@ -140,7 +140,7 @@ def decode_image(message: Image) -> np.ndarray:
     height = message.height * encoding.planes // 2
     rows = np.frombuffer(message.data, np.uint8, count=message.step * height)
     rows = rows.reshape(height, message.step)[:, : message.width * encoding.channels * encoding.bits // 8]
-    pixels = np.ascontiguousarray(rows)
+    pixels: np.ndarray = np.ascontiguousarray(rows)
     if message.encoding == "nv24":
         # A chroma of each pixel, in rows of twice the width: OpenCV takes one of four (NV12).
         brightness, chroma = np.split(pixels, [message.height])
@@ -268,7 +268,7 @@ def decode_pose(message: AnyPose | Odometry, name: str) -> np.ndarray:
     Raises:
         ValueError: a value that is not finite, or a quaternion of zeros.
     """
-    pose: Pose = getattr(message.pose, "pose", message.pose)
+    pose = message.pose.pose if isinstance(message.pose, PoseWithCovariance) else message.pose
     position, orientation = pose.position, pose.orientation
     translation = np.array([position.x, position.y, position.z])
     quaternion = np.array([orientation.x, orientation.y, orientation.z, orientation.w])
@@ -288,10 +288,9 @@ def decode_covariance(message: AnyPose, name: str) -> np.ndarray | None:
     Raises:
         ValueError: a value that is not finite, or a negative variance.
     """
-    values = getattr(message.pose, "covariance", None)
-    if values is None or not np.any(values):
+    if not isinstance(message.pose, PoseWithCovariance) or not np.any(message.pose.covariance):
         return None
-    covariance = np.array(values, dtype=np.float64).reshape(6, 6)
+    covariance = np.array(message.pose.covariance, dtype=np.float64).reshape(6, 6)
     if not np.isfinite(covariance).all() or covariance.diagonal().min() < 0:
         raise ValueError(f"{name} has covariance {covariance.tolist()}: all must be finite, and no variance negative")
     largest = np.abs(covariance).max()

@@ -99,6 +99,7 @@ class Pose(Protocol):
     orientation: Quaternion
 
 
+@runtime_checkable
 class PoseWithCovariance(Protocol):
     """geometry_msgs/PoseWithCovariance."""
 

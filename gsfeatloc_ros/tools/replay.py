@@ -165,10 +165,12 @@ def _parser() -> argparse.ArgumentParser:
     map_, matcher, localizer = MapSettings(), MatcherSettings(), LocalizerOptions()
     parser.add_argument("bag", type=Path, help="folder of a rosbag2, or an .mcap or .db3 file")
     parser.add_argument("--map", type=Path, required=True, help="the Gaussian Splatting map")
-    topic = {"metavar": "TOPIC", "required": True}
-    parser.add_argument("--image", **topic, help="sensor_msgs/Image or CompressedImage")
-    parser.add_argument("--camera-info", **topic, help="sensor_msgs/CameraInfo")
-    parser.add_argument("--prior", **topic, help="geometry_msgs/PoseStamped or PoseWithCovarianceStamped")
+    for option, types in (
+        ("--image", "sensor_msgs/Image or CompressedImage"),
+        ("--camera-info", "sensor_msgs/CameraInfo"),
+        ("--prior", "geometry_msgs/PoseStamped or PoseWithCovarianceStamped"),
+    ):
+        parser.add_argument(option, metavar="TOPIC", required=True, help=types)
     parser.add_argument(
         "--truth",
         metavar="TOPIC",

@@ -46,7 +46,8 @@ def prior(seconds: float, pose: np.ndarray, frame: str = "map", covariance: np.n
 
 
 def odometry(seconds: float, pose: np.ndarray, child: str = "base_link") -> Message:
-    return Message(header=header(seconds, "odom"), child_frame_id=child, pose=Message(pose=pose_fields(pose)))
+    fields = Message(pose=pose_fields(pose), covariance=[0.0] * 36)
+    return Message(header=header(seconds, "odom"), child_frame_id=child, pose=fields)
 
 
 def camera_info(width: int = 8, height: int = 6) -> Message:

@@ -1,0 +1,133 @@
+"""What comes in: the newest message of each topic is kept, and an image offered when it is due."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
+from nav_msgs.msg import Odometry
+from rclpy.node import Node
+from rclpy.subscription import Subscription
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+
+from gsfeatloc_ros.node.attempts import Job
+from gsfeatloc_ros.node.qos import NEWEST, ODOMETRY, RELIABLE, Topic, subscribe
+from gsfeatloc_ros.node.report import Report
+from gsfeatloc_ros.node.settings import COMPRESSED, ON_PRIOR, ON_REQUEST, Settings
+from gsfeatloc_ros.ros_io.decode import nanoseconds, validate_image
+from gsfeatloc_ros.ros_io.inputs import Inputs, InputTopic
+
+_TOPICS = (
+    (Topic(CameraInfo, "camera_info", NEWEST), InputTopic.CAMERA_INFO),
+    (Topic(PoseStamped, "prior", RELIABLE), InputTopic.PRIOR),
+    (Topic(PoseWithCovarianceStamped, "prior_with_covariance", RELIABLE), InputTopic.PRIOR),
+    (Topic(PoseWithCovarianceStamped, "initialpose", RELIABLE), InputTopic.INITIAL_POSE),
+)
+_ODOMETRY_TOPIC = (Topic(Odometry, "odom", ODOMETRY), InputTopic.ODOMETRY)
+
+
+class Reception:
+    """Listens to the node's topics; all of it runs in the executor's thread.
+
+    Callbacks only check and keep the newest message of each topic: an image here, the others in the inputs.
+
+    Args:
+        node: whose topics they are.
+        settings: of the node.
+        inputs: that take all but the images.
+        report: of what cannot be used.
+        offer: is given an image that is due.
+    """
+
+    def __init__(
+        self, node: Node, settings: Settings, inputs: Inputs, report: Report, offer: Callable[[Job], None]
+    ) -> None:
+        self._node, self._settings, self._inputs, self._report, self._offer = node, settings, inputs, report, offer
+        compressed = settings.image.transport == COMPRESSED
+        image_type = CompressedImage if compressed else Image
+        # As image_transport does: a remapping of image holds for the compressed ones as well.
+        name = node.resolve_topic_name("image") + "/compressed" if compressed else "image"
+        self._image_topic = Topic(image_type, name, NEWEST)
+        resolved = node.resolve_topic_name(name)
+        self.no_image = f"no image yet: publish sensor_msgs/{image_type.__name__} on {resolved}"
+        # The newest image, or why it cannot be used.
+        self._job: Job | str = self.no_image
+        self._prior_pending = False
+        # Stamp of the last image that was offered, in nanoseconds.
+        self._last_offered = 0
+        self._subscriptions: list[Subscription] = []
+
+    @property
+    def topics(self) -> list[str]:
+        """Names of the topics that are listened to, remapped."""
+        return [subscription.topic_name for subscription in self._subscriptions]
+
+    def listen(self) -> None:
+        """Begin to listen."""
+        self._subscribe(self._image_topic, self._on_image)
+        topics = (*_TOPICS, _ODOMETRY_TOPIC) if self._settings.node.track else _TOPICS
+        for topic, kind in topics:
+            self._subscribe(topic, partial(self._on_input, kind))
+
+    def stop_listening(self) -> None:
+        """Stop to listen, and forget the newest image."""
+        for subscription in self._subscriptions:
+            self._node.destroy_subscription(subscription)
+        self._subscriptions = []
+        self._job = self.no_image
+
+    def use_settings(self, settings: Settings) -> None:
+        """Go on with other settings, as far as they can change."""
+        self._settings = settings
+
+    def newest(self) -> Job:
+        """Return the newest image as a job; raise ValueError, which names all that is missing, where it cannot be."""
+        problems, job, silence = self._inputs.missing, self._job, self._report.health.silence
+        if isinstance(job, str):
+            raise ValueError("; ".join([job, *problems]))
+        if silence > self._settings.image.timeout:
+            problems.insert(0, f"the newest image came {silence:.1f} s ago: is the camera running?")
+        if problems:
+            raise ValueError("; ".join(problems))
+        return job
+
+    def _subscribe(self, topic: Topic, callback: Callable[[Any], None]) -> None:
+        refuse = partial(self._report.refuse, f"qos of {topic.name}")
+        self._subscriptions.append(subscribe(self._node, topic, callback, refuse))
+
+    def _on_image(self, message: Image | CompressedImage) -> None:
+        self._report.count_image()
+        try:
+            if isinstance(message, Image):
+                validate_image(message)
+        except ValueError as error:
+            self._job = str(error)
+            self._report.refuse("image", str(error), message.header.stamp)
+            return
+        self._job = Job(message)
+        if self._is_due(nanoseconds(message.header.stamp)):
+            self._offer(self._job)
+
+    def _is_due(self, stamp: int) -> bool:
+        """Return whether an image is to be localized without being asked for, and note that it is."""
+        mode, max_rate = self._settings.node.mode, self._settings.node.max_rate
+        stamp = stamp or self._node.get_clock().now().nanoseconds
+        if mode == ON_REQUEST or (mode == ON_PRIOR and not self._prior_pending):
+            return False
+        # Stamps that go back are those of a bag that starts anew.
+        if max_rate and 0 <= stamp - self._last_offered < 1e9 / max_rate:
+            return False
+        self._prior_pending, self._last_offered = False, stamp
+        return True
+
+    def _on_input(self, topic: InputTopic, message: Any) -> None:
+        taken = True
+        try:
+            self._inputs.take(topic, message)
+        except ValueError as error:
+            taken = False
+            self._report.refuse(topic.value, str(error), message.header.stamp)
+        if topic in (InputTopic.PRIOR, InputTopic.INITIAL_POSE):
+            self._prior_pending = taken

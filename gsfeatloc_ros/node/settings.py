@@ -1,0 +1,123 @@
+"""The node's settings, which are its ROS parameters. This imports nothing of ROS."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from gsfeatloc_ros.common.parameter import Value, parameter, parameters_of, settings_from
+from gsfeatloc_ros.localize.options import LocalizerOptions
+from gsfeatloc_ros.localize.settings import MapSettings, MatcherSettings, RendererSettings
+from gsfeatloc_ros.ros_io.prior import PriorPolicy
+
+CONTINUOUS, ON_PRIOR, ON_REQUEST = "continuous", "on_prior", "on_request"
+CAMERA, BASE = "camera", "base"
+RAW, COMPRESSED = "raw", "compressed"
+
+_POLICY = PriorPolicy()
+
+
+@dataclass(frozen=True)
+class NodeSettings:
+    """When the node works, and of what its poses are."""
+
+    mode: str = parameter(
+        CONTINUOUS,
+        "When to localize: continuous (the newest image), on_prior (one image for each prior), on_request (services).",
+        choices=(CONTINUOUS, ON_PRIOR, ON_REQUEST),
+        live=True,
+    )
+    max_rate: float = parameter(
+        0.0, "Most images localized a second, by their stamps; 0 for no limit.", (0.0, 1000.0), live=True
+    )
+    autostart: bool = parameter(True, "Load the map and start at once; false waits for a lifecycle manager.")
+    track: bool = parameter(
+        False, "Go on from the last answer until a prior comes, carried by odometry (on odom) where there is some."
+    )
+    prior_frame: str = parameter(
+        CAMERA, "What priors are poses of: camera (its optical frame) or base.", choices=(CAMERA, BASE)
+    )
+    pose_frame: str = parameter(
+        CAMERA, "What answers are poses of: camera (its optical frame) or base.", choices=(CAMERA, BASE)
+    )
+    base_frame: str = parameter(
+        _POLICY.base_frame, "Name of the robot base's frame; tf must know the way from it to the camera."
+    )
+    odom_frame: str = parameter("odom", "Name of the odometry's frame, for publish_tf.")
+    publish_tf: bool = parameter(
+        False, "Broadcast the transform from the map's frame to odom_frame; needs map.aligned."
+    )
+    transform_tolerance: float = parameter(
+        0.1, "Seconds by which the stamp of that transform is ahead of the clock.", (0.0, 10.0)
+    )
+    prior_max_age: float = parameter(
+        _POLICY.max_age,
+        "Seconds by which a prior, or the last answer, may be older or newer than the image; 0 for no limit.",
+        (0.0, 1e6),
+        live=True,
+    )
+    odometry_max_age: float = parameter(
+        _POLICY.odometry_max_age, "The same where odometry carries it to the image's time.", (0.0, 3600.0)
+    )
+
+
+@dataclass(frozen=True)
+class ImageSettings:
+    """How images come."""
+
+    transport: str = parameter(
+        RAW,
+        "How images come: raw (on the topic image), or compressed (JPEG or PNG, on image/compressed).",
+        choices=(RAW, COMPRESSED),
+    )
+    rectified: bool = parameter(
+        False, "Whether images are rectified: then the camera is that of camera_info's P, without distortion."
+    )
+    timeout: float = parameter(
+        5.0, "Seconds without an image after which there is none for requests.", (0.1, 3600.0), live=True
+    )
+
+
+@dataclass(frozen=True)
+class Settings:
+    """All settings of the node, by the groups of its parameters; those of `node` are in no group."""
+
+    node: NodeSettings = field(default_factory=NodeSettings)
+    map: MapSettings = field(default_factory=MapSettings)
+    image: ImageSettings = field(default_factory=ImageSettings)
+    matcher: MatcherSettings = field(default_factory=MatcherSettings)
+    renderer: RendererSettings = field(default_factory=RendererSettings)
+    localizer: LocalizerOptions = field(default_factory=LocalizerOptions)
+
+    @staticmethod
+    def of(values: Mapping[str, Value]) -> Settings:
+        """Return the settings of parameter values by name; those that are not there have their defaults."""
+        return Settings(
+            node=settings_from(NodeSettings, values),
+            map=settings_from(MapSettings, values, "map."),
+            image=settings_from(ImageSettings, values, "image."),
+            matcher=settings_from(MatcherSettings, values, "matcher."),
+            renderer=settings_from(RendererSettings, values, "renderer."),
+            localizer=settings_from(LocalizerOptions, values, "localizer."),
+        )
+
+    def prior_policy(self) -> PriorPolicy:
+        """Return what priors are worth."""
+        return PriorPolicy(
+            map_frame=self.map.frame_id,
+            base_frame=self.node.base_frame,
+            of_base=self.node.prior_frame == BASE,
+            max_age=self.node.prior_max_age,
+            odometry_max_age=self.node.odometry_max_age,
+        )
+
+
+_GROUPS = {
+    "": NodeSettings,
+    "map.": MapSettings,
+    "image.": ImageSettings,
+    "matcher.": MatcherSettings,
+    "renderer.": RendererSettings,
+    "localizer.": LocalizerOptions,
+}
+PARAMETERS = tuple(item for prefix, group in _GROUPS.items() for item in parameters_of(group, prefix))
