@@ -5,80 +5,16 @@ from __future__ import annotations
 import ast
 import importlib.util
 import os
-import re
 import subprocess
 import sys
-from dataclasses import fields
 from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
-import yaml
 from ament_index_python.packages import get_package_prefix, get_package_share_directory
-
-from gsfeatloc_ros.localize.localizer import LocalizerOptions
-from gsfeatloc_ros.node.parameters import PARAMETERS, Parameter, Value
 
 ROOT = Path(__file__).parents[2]
 SOURCES = sorted((ROOT / "gsfeatloc_ros").rglob("*.py"))
-DEFAULTS = {parameter.name: parameter.default for parameter in PARAMETERS}
-by_name = pytest.mark.parametrize("parameter", PARAMETERS, ids=lambda parameter: parameter.name)
-
-
-def yaml_lines(parameter: Parameter) -> tuple[str, str]:
-    """The comment above a parameter in config/localizer.yaml, and its value."""
-    group, _, name = parameter.name.rpartition(".")
-    text, indent = (ROOT / "config" / "localizer.yaml").read_text(), "    "
-    if group:
-        text, indent = re.search(rf"^    {group}:\n((?:      .*\n)+)", text, re.MULTILINE)[1], "      "
-    comment, value = re.search(rf"^{indent}# (.*)\n{indent}{name}: (.*)\n", text, re.MULTILINE).groups()
-    return comment, value
-
-
-def test_yaml_has_every_parameter_with_its_default():
-    tree = yaml.safe_load((ROOT / "config" / "localizer.yaml").read_text())["/**"]["ros__parameters"]
-    values = {name: value for name, value in tree.items() if not isinstance(value, dict)}
-    groups = {name: value for name, value in tree.items() if isinstance(value, dict)}
-    values |= {f"{group}.{name}": value for group, names in groups.items() for name, value in names.items()}
-    assert values == DEFAULTS
-    assert {name: type(value) for name, value in values.items()} == {n: type(v) for n, v in DEFAULTS.items()}
-
-
-@by_name
-def test_yaml_comment_is_the_description_with_the_range(parameter):
-    comment, _ = yaml_lines(parameter)
-    bounds = f" {parameter.bounds[0]} to {parameter.bounds[1]}." if parameter.bounds else ""
-    assert comment == parameter.description + bounds + (" Also at run time." if parameter.live else "")
-
-
-@by_name
-def test_descriptor_says_what_the_parameter_is(parameter):
-    descriptor = parameter.descriptor()
-    assert descriptor.description == parameter.description
-    assert descriptor.read_only != parameter.live
-    ranges = [*descriptor.integer_range, *descriptor.floating_point_range]
-    if isinstance(parameter.default, str | bool | list):
-        assert not ranges
-    else:
-        assert (ranges[0].from_value, ranges[0].to_value) == parameter.bounds
-        assert parameter.bounds[0] <= parameter.default <= parameter.bounds[1]
-
-
-def test_readme_has_every_parameter_with_its_default():
-    section = (ROOT / "README.md").read_text().split("## Parameters")[1].split("\n## ")[0]
-    rows = re.findall(r"^\| `([a-z_.]+)` \| `([^`]*)` \| (\*)?", section, re.MULTILINE)
-    assert {name: default for name, default, _ in rows} == {n: readme_text(v) for n, v in DEFAULTS.items()}
-    assert {name for name, _, star in rows if star} == {parameter.name for parameter in PARAMETERS if parameter.live}
-
-
-def readme_text(value: Value) -> str:
-    """As YAML has it, but that only the empty string has quotes."""
-    return str(value).lower() if isinstance(value, bool) else str(value) or '""'
-
-
-def test_every_option_of_the_localizer_is_a_parameter():
-    names = {name.removeprefix("localizer.") for name in DEFAULTS if name.startswith("localizer.")}
-    assert names == {field.name for field in fields(LocalizerOptions)}
 
 
 def test_executable_is_where_ros2_run_looks():

@@ -1,0 +1,123 @@
+"""The node's settings: described once, and the same in ROS, in the YAML and in the documents."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import fields, replace
+from pathlib import Path
+
+import pytest
+import yaml
+
+from gsfeatloc_ros.localize.options import LocalizerOptions
+from gsfeatloc_ros.node.parameters import descriptor
+from gsfeatloc_ros.node.settings import PARAMETERS, ImageSettings, NodeSettings, Settings
+from gsfeatloc_ros.ros_io.prior import PriorPolicy
+from gsfeatloc_ros.tools.parameters import main, page_text, yaml_text
+
+ROOT = Path(__file__).parents[2]
+DEFAULTS = {parameter.name: parameter.default for parameter in PARAMETERS}
+by_name = pytest.mark.parametrize("parameter", PARAMETERS, ids=lambda parameter: parameter.name)
+
+
+def test_files_are_as_they_are_generated():
+    assert main(["--check"]) == 0
+    assert (ROOT / "config" / "localizer.yaml").read_text() == yaml_text()
+    assert (ROOT / "docs" / "parameters.md").read_text() == page_text()
+
+
+def test_what_is_out_of_date_is_named_and_written(tmp_path, capsys):
+    for folder in ("config", "docs"):
+        (tmp_path / folder).mkdir()
+    (tmp_path / "docs" / "parameters.md").write_text("old")
+    assert main(["--check", "--root", str(tmp_path)]) == 1
+    said = capsys.readouterr().err
+    assert f"{tmp_path}/config/localizer.yaml is out of date" in said
+    assert f"{tmp_path}/docs/parameters.md is out of date" in said
+    assert (tmp_path / "docs" / "parameters.md").read_text() == "old"
+    assert main(["--root", str(tmp_path)]) == 0
+    assert main(["--check", "--root", str(tmp_path)]) == 0
+    assert (tmp_path / "docs" / "parameters.md").read_text() == page_text()
+
+
+def test_the_command_needs_no_ros():
+    hide = "import sys; sys.modules.update(dict.fromkeys(['rclpy', 'rcl_interfaces', 'sensor_msgs']));"
+    code = f"{hide} from gsfeatloc_ros.tools.parameters import main; sys.exit(main(['--check']))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
+
+
+def test_yaml_has_every_parameter_with_its_default_and_type():
+    tree = yaml.safe_load(yaml_text())["/**"]["ros__parameters"]
+    values = {name: value for name, value in tree.items() if not isinstance(value, dict)}
+    groups = {name: value for name, value in tree.items() if isinstance(value, dict)}
+    values |= {f"{group}.{name}": value for group, names in groups.items() for name, value in names.items()}
+    defaults = {name: list(value) if isinstance(value, tuple) else value for name, value in DEFAULTS.items()}
+    assert values == defaults
+    assert {name: type(value) for name, value in values.items()} == {n: type(v) for n, v in defaults.items()}
+
+
+@by_name
+def test_page_has_a_row_for_the_parameter(parameter):
+    rows = [line for line in page_text().splitlines() if line.startswith(f"| `{parameter.name}` |")]
+    assert len(rows) == 1
+    assert rows[0].endswith(f" {parameter.description} |")
+    assert ("| live |" in rows[0]) == parameter.live
+    assert all(f"`{choice}`" in rows[0] for choice in parameter.choices)
+
+
+@by_name
+def test_descriptor_is_what_the_parameter_is(parameter):
+    made = descriptor(parameter)
+    assert made.description == parameter.description
+    assert made.read_only != parameter.live
+    ranges = [*made.integer_range, *made.floating_point_range]
+    if isinstance(parameter.default, str | bool | tuple):
+        assert not ranges
+        assert not parameter.bounds
+    else:
+        assert (ranges[0].from_value, ranges[0].to_value) == parameter.bounds
+        assert parameter.bounds[0] <= parameter.default <= parameter.bounds[1]
+        assert bool(made.floating_point_range) == isinstance(parameter.default, float)
+    assert ("One of" in made.additional_constraints) == bool(parameter.choices)
+    parameter.check(parameter.default)
+
+
+def test_every_name_is_of_one_parameter():
+    assert len(DEFAULTS) == len(PARAMETERS)
+
+
+def test_settings_of_the_defaults_are_the_defaults():
+    assert Settings.of({}) == Settings.of(DEFAULTS) == Settings()
+
+
+@by_name
+def test_each_value_comes_to_one_setting(parameter):
+    other = {bool: True, int: 5, float: 0.125, str: "other", tuple: (1.0, 2.0, 3.0)}[type(parameter.default)]
+    value = (not parameter.default) if isinstance(parameter.default, bool) else other
+    settings = Settings.of({parameter.name: value})
+    assert settings != Settings()
+    assert Settings.of(DEFAULTS | {parameter.name: value}) == settings
+    assert repr(settings) != repr(Settings())
+    assert repr(value) in repr(settings)
+
+
+def test_what_is_no_parameter_does_not_count():
+    assert Settings.of({"use_sim_time": True, "map.nothing": 1}) == Settings()
+
+
+def test_options_of_the_localizer_are_parameters_but_for_those_of_experts():
+    options = LocalizerOptions()
+    nested = [getattr(options, name) for name in ("pose", "limits", "lift")]
+    names = {item.name for settings in (options, *nested) for item in fields(settings)} - {"pose", "limits", "lift"}
+    parameters = {name.removeprefix("localizer.") for name in DEFAULTS if name.startswith("localizer.")}
+    assert names - parameters == {"cauchy_scale", "shared_error", "min_alpha", "max_depth_step"}
+    assert parameters <= names
+
+
+def test_policy_on_priors_follows_the_settings():
+    assert Settings().prior_policy() == PriorPolicy()
+    node = NodeSettings(prior_frame="base", base_frame="body", prior_max_age=2.0, odometry_max_age=3.0)
+    settings = replace(Settings(), node=node, image=ImageSettings(timeout=1.0))
+    assert settings.prior_policy() == PriorPolicy("map", "body", True, 2.0, 3.0)
