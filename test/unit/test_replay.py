@@ -1,8 +1,7 @@
-"""Replay of bags, its outputs read back with code of their own, and the node's answers to the same bag."""
+"""Replay of bags, its outputs read back with code of their own."""
 
 from __future__ import annotations
 
-import csv
 import subprocess
 import sys
 from pathlib import Path
@@ -11,14 +10,27 @@ import cv2
 import numpy as np
 import pytest
 import yaml
+from bags import (
+    TOPICS,
+    TRUTH,
+    camera_info,
+    compressed_image,
+    image,
+    odometry,
+    pose_stamped,
+    pose_with_covariance,
+    recording,
+    replay_arguments,
+    rotated,
+    rows_of,
+    write_messages,
+)
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from rosbags.highlevel import AnyReader
-from rosbags.rosbag2 import StoragePlugin, Writer
-from rosbags.typesys import Stores, get_typestore
+from rosbags.rosbag2 import StoragePlugin
 
-from gsfeatloc_ros.client.bag_player import Topics, play_bag
-from gsfeatloc_ros.common.geometry import make_pose, quaternion_from_matrix, so3_exp
+from gsfeatloc_ros.common.geometry import make_pose, so3_exp
 from gsfeatloc_ros.localize.localizer import Localizer
 from gsfeatloc_ros.localize.options import LocalizerOptions
 from gsfeatloc_ros.maps import load_map
@@ -31,132 +43,12 @@ from gsfeatloc_ros.ros_io.decode import decode_compressed_image, decode_covarian
 from gsfeatloc_ros.ros_io.outcome import OutcomeStatus
 from gsfeatloc_ros.ros_io.prior import PriorPolicy
 from gsfeatloc_ros.simulate import write_bag
-from gsfeatloc_ros.tools.demo import running_localizer
+from gsfeatloc_ros.simulate.bag_messages import header, make
 from gsfeatloc_ros.tools.replay import main
 
-TOPICS = {"image": "/camera/image_raw", "camera_info": "/camera/camera_info", "prior": "/prior"}
-TRUTH = "/ground_truth"
-STORE = get_typestore(Stores.ROS2_JAZZY)
 storages = pytest.mark.parametrize("storage", [StoragePlugin.MCAP, StoragePlugin.SQLITE3], ids=["mcap", "sqlite3"])
 # A slow, shared machine is no reason to fail.
 unhurried = settings(deadline=None, max_examples=25, suppress_health_check=list(HealthCheck))
-
-
-def kind(name: str) -> type:
-    return STORE.types[name]
-
-
-def header(stamp: float, frame: str = "map") -> object:
-    nanoseconds = round(1e9 * stamp)
-    time = kind("builtin_interfaces/msg/Time")(sec=nanoseconds // 10**9, nanosec=nanoseconds % 10**9)
-    return kind("std_msgs/msg/Header")(stamp=time, frame_id=frame)
-
-
-def pose_of(T_map_camera: np.ndarray) -> object:
-    position = kind("geometry_msgs/msg/Point")(*T_map_camera[:3, 3].tolist())
-    orientation = kind("geometry_msgs/msg/Quaternion")(*quaternion_from_matrix(T_map_camera[:3, :3]).tolist())
-    return kind("geometry_msgs/msg/Pose")(position=position, orientation=orientation)
-
-
-def pose_stamped(stamp: float, T_map_camera: np.ndarray, frame: str = "map") -> object:
-    return kind("geometry_msgs/msg/PoseStamped")(header=header(stamp, frame), pose=pose_of(T_map_camera))
-
-
-def with_covariance(T_map_camera: np.ndarray, covariance: np.ndarray) -> object:
-    return kind("geometry_msgs/msg/PoseWithCovariance")(pose=pose_of(T_map_camera), covariance=covariance.ravel())
-
-
-def pose_with_covariance(stamp: float, T_map_camera: np.ndarray, covariance: np.ndarray) -> object:
-    pose = with_covariance(T_map_camera, covariance)
-    return kind("geometry_msgs/msg/PoseWithCovarianceStamped")(header=header(stamp), pose=pose)
-
-
-def odometry(stamp: float, T_map_camera: np.ndarray) -> object:
-    zero = kind("geometry_msgs/msg/Vector3")(0.0, 0.0, 0.0)
-    twist = kind("geometry_msgs/msg/TwistWithCovariance")(
-        twist=kind("geometry_msgs/msg/Twist")(linear=zero, angular=zero), covariance=np.zeros(36)
-    )
-    pose = with_covariance(T_map_camera, np.zeros((6, 6)))
-    return kind("nav_msgs/msg/Odometry")(header=header(stamp), child_frame_id="camera", pose=pose, twist=twist)
-
-
-def image(stamp: float, rgb: np.ndarray, encoding: str = "rgb8") -> object:
-    height, width = rgb.shape[:2]
-    return kind("sensor_msgs/msg/Image")(
-        header=header(stamp, "camera"),
-        height=height,
-        width=width,
-        encoding=encoding,
-        is_bigendian=0,
-        step=3 * width,
-        data=np.ascontiguousarray(rgb).ravel(),
-    )
-
-
-def compressed_image(stamp: float, rgb: np.ndarray, suffix: str, form: str) -> object:
-    data = cv2.imencode(suffix, rgb[:, :, ::-1])[1].ravel()
-    return kind("sensor_msgs/msg/CompressedImage")(header=header(stamp, "camera"), format=form, data=data)
-
-
-def camera_info(stamp: float, camera, focal: float | None = None) -> object:
-    K = camera.K if focal is None else np.diag([focal, focal, 1.0])
-    return kind("sensor_msgs/msg/CameraInfo")(
-        header=header(stamp, "camera"),
-        height=camera.height,
-        width=camera.width,
-        distortion_model=camera.model,
-        d=camera.distortion,
-        k=K.ravel(),
-        r=np.eye(3).ravel(),
-        p=np.zeros(12),
-        binning_x=0,
-        binning_y=0,
-        roi=kind("sensor_msgs/msg/RegionOfInterest")(x_offset=0, y_offset=0, height=0, width=0, do_rectify=False),
-    )
-
-
-def write(path: Path, messages: list, storage: StoragePlugin = StoragePlugin.MCAP, topics: dict | None = None) -> Path:
-    """A bag of (topic, message) or (topic, (type, bytes)), recorded a millisecond apart."""
-    with Writer(path, version=9, storage_plugin=storage) as writer:
-        connections = {}
-        for topic, name in (topics or {}).items():
-            connections[topic] = writer.add_connection(topic, name, typestore=STORE)
-        for number, (topic, message) in enumerate(messages, start=1):
-            name, cdr = message if isinstance(message, tuple) else (message.__msgtype__, None)
-            if topic not in connections:
-                connections[topic] = writer.add_connection(topic, name, typestore=STORE)
-            cdr = STORE.serialize_cdr(message, name) if cdr is None else cdr
-            writer.write(connections[topic], 10**9 + 10**6 * number, cdr)
-    return path
-
-
-def recording(photo, camera, *, stamp: float | None = None) -> list:
-    """The messages of a photo, in the order of write_bag."""
-    stamp = photo.stamp if stamp is None else stamp
-    return [
-        (TOPICS["prior"], pose_stamped(stamp - 0.01, photo.T_map_camera_prior)),
-        (TOPICS["camera_info"], camera_info(stamp, camera)),
-        (TOPICS["image"], image(stamp, photo.image)),
-        (TRUTH, pose_stamped(stamp, photo.T_map_camera)),
-    ]
-
-
-def arguments(bag: Path, map_file: Path, out: Path, *more: str, truth: bool = True) -> list[str]:
-    options = [str(bag), "--map", str(map_file), "--out", str(out)]
-    for role, topic in TOPICS.items():
-        options += [f"--{role.replace('_', '-')}", topic]
-    return [*options, *(["--truth", TRUTH] if truth else []), *more]
-
-
-def rows_of(out: Path) -> list[dict[str, str]]:
-    with (out / "answers.csv").open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
-def rotated(quaternion: np.ndarray) -> np.ndarray:
-    """Where a quaternion xyzw takes the three axes, as columns: v + 2 u x (u x v + w v)."""
-    u, w = np.array(quaternion[:3]), quaternion[3]
-    return np.column_stack([v + 2 * np.cross(u, np.cross(u, v) + w * v) for v in np.eye(3)])
 
 
 def distance(pose: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
@@ -169,7 +61,7 @@ def distance(pose: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
 def test_outputs_of_a_bag(storage, room_camera, room_photos, room_map_file, tmp_path, capsys):
     photos, out = room_photos[:3], tmp_path / "new" / "out"
     write_bag(tmp_path / "bag", room_camera, photos, storage)
-    assert main(arguments(tmp_path / "bag", room_map_file, out)) == 0
+    assert main(replay_arguments(tmp_path / "bag", room_map_file, out)) == 0
     said = capsys.readouterr().out
     assert "localized 3 of 3 images" in said
     assert "truth known for 3 of the 3 answers" in said
@@ -208,7 +100,10 @@ def test_outputs_of_a_bag(storage, room_camera, room_photos, room_map_file, tmp_
 
 def test_answers_are_those_of_the_localizer(room_camera, room_photos, room_map_file, tmp_path):
     write_bag(tmp_path / "bag", room_camera, room_photos[:2])
-    assert main(arguments(tmp_path / "bag", room_map_file, tmp_path / "out", "--set", "max_passes=2", truth=False)) == 0
+    assert (
+        main(replay_arguments(tmp_path / "bag", room_map_file, tmp_path / "out", "--set", "max_passes=2", truth=False))
+        == 0
+    )
     renderer, matcher = create_renderer(load_map(room_map_file)), create_matcher("sift")
     localizer = Localizer(renderer, matcher, LocalizerOptions(max_passes=2))
     for photo, line, row in zip(
@@ -220,37 +115,6 @@ def test_answers_are_those_of_the_localizer(room_camera, room_photos, room_map_f
         assert rotated(line[4:]) == pytest.approx(estimate.T_map_camera[:3, :3], abs=1e-7)
     assert "rotation_error_deg" not in rows_of(tmp_path / "out")[0]
     assert not (tmp_path / "out" / "errors.png").exists()
-
-
-def test_answers_are_those_of_the_node(room_camera, room_photos, room_map_file, tmp_path):
-    """Also where an image comes before its camera_info, and where an unusable prior took the place of a good one."""
-    first, second, third, fourth = room_photos[:4]
-    elsewhere = pose_stamped(fourth.stamp - 0.02, fourth.T_map_camera_prior, "odom")
-    messages = [
-        *recording(first, room_camera)[:1],
-        *recording(first, room_camera)[2:],
-        *recording(second, room_camera),
-        *recording(third, room_camera)[2:],  # with the prior of the second
-        (TOPICS["prior"], elsewhere),
-        *recording(fourth, room_camera)[1:],
-        *recording(fourth, room_camera, stamp=fourth.stamp + 0.5),
-    ]
-    bag = write(tmp_path / "bag", messages)
-    assert main(arguments(bag, room_map_file, tmp_path / "out")) == 0
-    with running_localizer(room_map_file, "sift", tmp_path / "log") as process:
-        live = list(play_bag(bag, Topics(**TOPICS), is_running=lambda: process.poll() is None))
-    rows = rows_of(tmp_path / "out")
-    assert [row["status"] for row in rows][:2] == ["refused", "localized"]
-    assert [row["status"] for row in rows][3:] == ["refused", "localized"]
-    for row, answer in zip(rows, live, strict=True):
-        assert (row["stamp"], row["status"]) == (answer.stamp, answer.evidence["status"])
-        if row["status"] != "refused":
-            assert row["reason"] == answer.evidence["reason"]
-        assert bool(row["x"]) == (answer.T_map_camera is not None)
-        if row["x"]:
-            pose = np.array([float(row[name]) for name in ("x", "y", "z", "qx", "qy", "qz", "qw")])
-            assert pose[:3] == pytest.approx(answer.T_map_camera[:3, 3], abs=1e-12)
-            assert rotated(pose[3:]) == pytest.approx(answer.T_map_camera[:3, :3], abs=1e-12)
 
 
 def test_other_types_of_messages(room_camera, room_photos, room_map_file, tmp_path, capsys):
@@ -266,8 +130,8 @@ def test_other_types_of_messages(room_camera, room_photos, room_map_file, tmp_pa
         (TRUTH, odometry(99.9, photo.T_map_camera @ np.linalg.inv(step))),
     ]
     # The prior is a hundred seconds older than the images.
-    bag, limit = write(tmp_path / "bag", messages), ("--prior-max-age", "0")
-    assert main(arguments(bag, room_map_file, tmp_path / "out", *limit)) == 0
+    bag, limit = write_messages(tmp_path / "bag", messages), ("--prior-max-age", "0")
+    assert main(replay_arguments(bag, room_map_file, tmp_path / "out", *limit)) == 0
     jpeg, png = rows_of(tmp_path / "out")
     assert (jpeg["status"], png["status"]) == ("localized", "localized")
     assert float(jpeg["rotation_error_deg"]) < 0.5
@@ -280,7 +144,7 @@ def test_the_command_needs_no_ros(room_camera, room_photos, room_map_file, tmp_p
     write_bag(tmp_path / "bag", room_camera, room_photos[:1])
     hide = "import sys; sys.modules.update(dict.fromkeys(['rclpy', 'sensor_msgs', 'geometry_msgs']));"
     code = f"{hide} from gsfeatloc_ros.tools.replay import main; sys.exit(main(sys.argv[1:]))"
-    command = [sys.executable, "-c", code, *arguments(tmp_path / "bag", room_map_file, tmp_path / "out")]
+    command = [sys.executable, "-c", code, *replay_arguments(tmp_path / "bag", room_map_file, tmp_path / "out")]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     assert "localized 1 of 1 images" in done.stdout
@@ -317,7 +181,7 @@ def test_images_are_paired_with_the_newest(localizer, small_camera, tmp_path_fac
         TOPICS["camera_info"]: "sensor_msgs/msg/CameraInfo",
         TOPICS["prior"]: "geometry_msgs/msg/PoseStamped",
     }
-    bag = write(tmp_path_factory.mktemp("bag") / "bag", messages, storage, kinds)
+    bag = write_messages(tmp_path_factory.mktemp("bag") / "bag", messages, storage, kinds)
     with open_bag(bag, {Role(role): topic for role, topic in TOPICS.items()}) as opened:
         replay = Replay(opened, localizer, PriorPolicy())
         replayed = iter(list(replay.images()))
@@ -363,7 +227,7 @@ def test_images_that_cannot_be_used_are_lines(room_camera, room_photos, room_map
         (TOPICS["image"], ("sensor_msgs/msg/Image", b"\x00\x01\x00\x00\xff")),
         (TRUTH, ("geometry_msgs/msg/PoseStamped", b"\x00\x01\x00\x00\xff")),
     ]
-    assert main(arguments(write(tmp_path / "bag", messages), room_map_file, tmp_path / "out")) == 0
+    assert main(replay_arguments(write_messages(tmp_path / "bag", messages), room_map_file, tmp_path / "out")) == 0
     rows = rows_of(tmp_path / "out")
     assert [row["status"] for row in rows] == ["refused", "localized", "refused", "refused"]
     assert rows[0]["reason"] == "no camera_info was recorded before this image"
@@ -389,7 +253,7 @@ def test_an_exception_is_a_line_and_an_interruption_keeps_what_came_before(
         return localize(*args)
 
     monkeypatch.setattr(Localizer, "localize", fail)
-    assert main(arguments(tmp_path / "bag", room_map_file, tmp_path / "out")) == 130
+    assert main(replay_arguments(tmp_path / "bag", room_map_file, tmp_path / "out")) == 130
     said = capsys.readouterr()
     assert "replay: interrupted" in said.err
     assert "localized 1 of 2 images; the bag has 3" in said.out
@@ -401,7 +265,7 @@ def test_an_exception_is_a_line_and_an_interruption_keeps_what_came_before(
 
 
 def test_no_answer_at_all(room_camera, room_map_file, tmp_path):
-    bag = write(
+    bag = write_messages(
         tmp_path / "bag",
         [event_message("image", 0, room_camera)],
         topics={
@@ -410,7 +274,7 @@ def test_no_answer_at_all(room_camera, room_map_file, tmp_path):
             TRUTH: "geometry_msgs/msg/PoseStamped",
         },
     )
-    assert main(arguments(bag, room_map_file, tmp_path / "out")) == 0
+    assert main(replay_arguments(bag, room_map_file, tmp_path / "out")) == 0
     assert (tmp_path / "out" / "answers.tum").read_text() == ""
     assert [row["status"] for row in rows_of(tmp_path / "out")] == ["refused"]
     assert (tmp_path / "out" / "errors.png").exists()
@@ -438,7 +302,7 @@ def refused(capsys, arguments: list[str]) -> str:
 )
 def test_options_that_cannot_be_used(room_camera, room_photos, room_map_file, tmp_path, capsys, option, topic, says):
     write_bag(tmp_path / "bag", room_camera, room_photos[:1])
-    options = arguments(tmp_path / "bag", room_map_file, tmp_path / "out", option, *topic.split())
+    options = replay_arguments(tmp_path / "bag", room_map_file, tmp_path / "out", option, *topic.split())
     assert says in refused(capsys, options)
     assert not (tmp_path / "out").exists()
 
@@ -446,7 +310,7 @@ def test_options_that_cannot_be_used(room_camera, room_photos, room_map_file, tm
 @storages
 def test_bags_that_cannot_be_used(storage, room_camera, room_photos, room_map_file, tmp_path, capsys):
     def says(bag: Path) -> str:
-        return refused(capsys, arguments(bag, room_map_file, tmp_path / "out", truth=False))
+        return refused(capsys, replay_arguments(bag, room_map_file, tmp_path / "out", truth=False))
 
     assert "no: there is no such bag" in says(tmp_path / "no")
     (tmp_path / "folder").mkdir()
@@ -455,12 +319,14 @@ def test_bags_that_cannot_be_used(storage, room_camera, room_photos, room_map_fi
     assert "folder: cannot be read" in says(tmp_path / "folder")
     (tmp_path / "notes.txt").write_text("not a bag")
     assert "notes.txt: cannot be read" in says(tmp_path / "notes.txt")
-    assert "has no topic /camera/image_raw; it has none: it is empty" in says(write(tmp_path / "bare", [], storage))
+    assert "has no topic /camera/image_raw; it has none: it is empty" in says(
+        write_messages(tmp_path / "bare", [], storage)
+    )
     quiet = dict.fromkeys(TOPICS.values(), "sensor_msgs/msg/Image") | {
         TOPICS["camera_info"]: "sensor_msgs/msg/CameraInfo",
         TOPICS["prior"]: "geometry_msgs/msg/PoseStamped",
     }
-    assert "has no message on /camera/image_raw" in says(write(tmp_path / "quiet", [], storage, quiet))
+    assert "has no message on /camera/image_raw" in says(write_messages(tmp_path / "quiet", [], storage, quiet))
 
     write_bag(tmp_path / "bag", room_camera, room_photos[:2], storage)
     (file,) = (tmp_path / "bag").glob("bag.*")
@@ -477,7 +343,7 @@ def test_what_comes_before_a_damage_is_kept(room_camera, room_photos, room_map_f
     whole = file.read_bytes()
     middle = len(whole) // 2
     file.write_bytes(whole[:middle] + b"\xff" * 5000 + whole[middle + 5000 :])
-    assert main(arguments(tmp_path / "bag", room_map_file, tmp_path / "out")) == 1
+    assert main(replay_arguments(tmp_path / "bag", room_map_file, tmp_path / "out")) == 1
     said = capsys.readouterr()
     assert "bag: is damaged, and ends here: " in said.err
     assert "; the bag has 4" in said.out
@@ -489,14 +355,14 @@ def test_what_comes_before_a_damage_is_kept(room_camera, room_photos, room_map_f
 
 def test_the_folder_of_the_results_must_be_empty(room_camera, room_photos, room_map_file, tmp_path, capsys):
     write_bag(tmp_path / "bag", room_camera, room_photos[:1])
-    said = refused(capsys, arguments(tmp_path / "bag", room_map_file, tmp_path))
+    said = refused(capsys, replay_arguments(tmp_path / "bag", room_map_file, tmp_path))
     assert "is there already: name a new or an empty folder" in said
 
 
 @pytest.mark.parametrize("text", ["max_views", "no_such=1", "max_views=many", "max_views=1,2"])
 def test_settings_that_cannot_be_used(tmp_path, text, capsys):
     with pytest.raises(SystemExit) as stop:
-        main(arguments(tmp_path, tmp_path, tmp_path, "--set", text))
+        main(replay_arguments(tmp_path, tmp_path, tmp_path, "--set", text))
     assert stop.value.code == 2
     assert "argument --set" in capsys.readouterr().err
 
@@ -529,7 +395,7 @@ def test_truth_that_is_not_known():
 
 def test_compressed_images_that_cannot_be_used():
     def message(data: bytes, form: str) -> object:
-        return kind("sensor_msgs/msg/CompressedImage")(header(0.0), form, np.frombuffer(data, np.uint8))
+        return make("sensor_msgs/msg/CompressedImage", header(0.0, "camera"), form, np.frombuffer(data, np.uint8))
 
     png = cv2.imencode(".png", SMALL)[1].tobytes()
     for data in (b"", b"\xff\xd8\xff", png[: len(png) // 2]):
