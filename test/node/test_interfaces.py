@@ -16,7 +16,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.serialization import deserialize_message, serialize_message
 
 ROOT = Path(__file__).parents[2]
-STATUSES = {"LOCALIZED": 0, "REJECTED": 1, "FAILED": 2, "REFUSED": 3}
+STATUSES = {"LOCALIZED": 0, "REJECTED": 1, "FAILED": 2, "REFUSED": 3, "ERROR": 4}
 
 
 def test_request_has_the_fields():

@@ -8,6 +8,7 @@ import numpy as np
 from node_harness import assert_close, connected_client, send_inputs
 
 from gsfeatloc_ros.client.messages import rgb_image, stamp_of
+from gsfeatloc_ros.localize.evidence import Evidence
 
 
 def test_image_and_prior_give_the_pose(client, room_camera, photo):
@@ -18,6 +19,9 @@ def test_image_and_prior_give_the_pose(client, room_camera, photo):
     assert diagnostic.values["status"] == "localized"
     assert int(diagnostic.values["inliers"]) >= 20
     assert float(diagnostic.values["ms_total"]) > 0
+    assert Evidence().numbers().keys() <= diagnostic.values.keys()
+    assert -1 <= float(diagnostic.values["correlation"]) <= 1
+    assert "ms_verify" in diagnostic.values
     pose = client.pose_of(image)
     assert pose.header.frame_id == "map"
     assert pose.header.stamp == image.header.stamp

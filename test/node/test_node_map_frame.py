@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-
 import numpy as np
 import pytest
 from node_harness import assert_start_fails, connected_client, running_localizer
@@ -11,46 +9,13 @@ from node_harness import assert_start_fails, connected_client, running_localizer
 from gsfeatloc_ros.client.messages import camera_info_of, pose_matrix, pose_stamped, rgb_image
 from gsfeatloc_ros.common.geometry import quaternion_from_matrix, rotation_error_deg, so3_exp, translation_error
 from gsfeatloc_ros.maps import Similarity
-from gsfeatloc_ros.node.parameters import PARAMETERS, map_alignment
 
-DEFAULTS = {parameter.name: parameter.default for parameter in PARAMETERS}
 # Of the room's file in the robot's frame.
 ALIGNMENT = Similarity(2.5, so3_exp(np.array([0.4, -1.1, 2.0])), np.array([12.0, -7.0, 3.0]))
 
 
 def numbers(values) -> str:
     return str([float(value) for value in values])
-
-
-def test_alignment_without_parameters_is_none():
-    alignment = map_alignment(DEFAULTS)
-    assert alignment.scale == 1.0
-    assert (alignment.rotation == np.eye(3)).all()
-    assert (alignment.translation == 0).all()
-
-
-def test_quaternion_is_normalized():
-    alignment = map_alignment(DEFAULTS | {"map.rotation": [0.0, 0.0, 5.0, 5.0]})
-    np.testing.assert_allclose(alignment.rotation, so3_exp(np.array([0, 0, np.pi / 2])), atol=1e-12)
-
-
-@pytest.mark.parametrize("transforms", [False, True])
-def test_alignment_is_scale_then_rotation_then_translation_after_nerfstudio(tmp_path, transforms):
-    values = DEFAULTS | {
-        "map.scale": ALIGNMENT.scale,
-        "map.rotation": quaternion_from_matrix(ALIGNMENT.rotation).tolist(),
-        "map.translation": ALIGNMENT.translation.tolist(),
-    }
-    points = np.random.default_rng(0).normal(size=(20, 3))
-    in_data = points
-    if transforms:
-        path = tmp_path / "dataparser_transforms.json"
-        turn, shift = so3_exp(np.array([0.3, 0.2, -0.9])), np.array([1.0, 2.0, 3.0])
-        path.write_text(json.dumps({"transform": np.column_stack([turn, shift]).tolist(), "scale": 0.25}))
-        values["map.dataparser_transforms"] = str(path)
-        in_data = (points / 0.25 - shift) @ turn  # x_splat = scale * (turn @ x_data + shift), undone
-    expected = 2.5 * in_data @ ALIGNMENT.rotation.T + ALIGNMENT.translation
-    np.testing.assert_allclose(map_alignment(values).transform(points), expected, atol=1e-9)
 
 
 def test_answers_are_in_the_frame_of_the_robot(room_map_file, room_camera, room_photos):

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from dataclasses import fields, replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 
+from gsfeatloc_ros.common.geometry import quaternion_from_matrix, so3_exp
 from gsfeatloc_ros.localize.options import LocalizerOptions
+from gsfeatloc_ros.localize.settings import MapSettings
+from gsfeatloc_ros.maps import Similarity
 from gsfeatloc_ros.node.parameters import descriptor
 from gsfeatloc_ros.node.settings import PARAMETERS, ImageSettings, NodeSettings, Settings
 from gsfeatloc_ros.ros_io.prior import PriorPolicy
@@ -121,3 +126,39 @@ def test_policy_on_priors_follows_the_settings():
     node = NodeSettings(prior_frame="base", base_frame="body", prior_max_age=2.0, odometry_max_age=3.0)
     settings = replace(Settings(), node=node, image=ImageSettings(timeout=1.0))
     assert settings.prior_policy() == PriorPolicy("map", "body", True, 2.0, 3.0)
+
+
+# The map's frame.
+
+ALIGNMENT = Similarity(2.5, so3_exp(np.array([0.4, -1.1, 2.0])), np.array([12.0, -7.0, 3.0]))
+
+
+def test_alignment_without_settings_is_none():
+    alignment = MapSettings().alignment()
+    assert alignment.scale == 1.0
+    assert (alignment.rotation == np.eye(3)).all()
+    assert (alignment.translation == 0).all()
+
+
+def test_quaternion_is_normalized():
+    alignment = MapSettings(rotation=(0.0, 0.0, 5.0, 5.0)).alignment()
+    np.testing.assert_allclose(alignment.rotation, so3_exp(np.array([0, 0, np.pi / 2])), atol=1e-12)
+
+
+@pytest.mark.parametrize("transforms", [False, True])
+def test_alignment_is_scale_then_rotation_then_translation_after_nerfstudio(tmp_path, transforms):
+    settings = MapSettings(
+        scale=ALIGNMENT.scale,
+        rotation=tuple(quaternion_from_matrix(ALIGNMENT.rotation)),
+        translation=tuple(ALIGNMENT.translation),
+    )
+    points = np.random.default_rng(0).normal(size=(20, 3))
+    in_data = points
+    if transforms:
+        path = tmp_path / "dataparser_transforms.json"
+        turn, shift = so3_exp(np.array([0.3, 0.2, -0.9])), np.array([1.0, 2.0, 3.0])
+        path.write_text(json.dumps({"transform": np.column_stack([turn, shift]).tolist(), "scale": 0.25}))
+        settings = replace(settings, dataparser_transforms=str(path))
+        in_data = (points / 0.25 - shift) @ turn  # x_splat = scale * (turn @ x_data + shift), undone
+    expected = 2.5 * in_data @ ALIGNMENT.rotation.T + ALIGNMENT.translation
+    np.testing.assert_allclose(settings.alignment().transform(points), expected, atol=1e-9)
