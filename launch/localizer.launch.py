@@ -14,6 +14,7 @@ TOPICS = ("image", "camera_info", "prior", "initialpose", "odom")
 
 
 def generate_launch_description() -> LaunchDescription:
+    """Return the node with its arguments: the map, a file of parameters, a namespace and a name for each topic."""
     default_params = PathJoinSubstitution([FindPackageShare("gsfeatloc_ros"), "config", "localizer.yaml"])
     return LaunchDescription(
         [

@@ -75,7 +75,7 @@ class Attempts:
 
     @property
     def engine(self) -> Engine:
-        """That localizes."""
+        """The engine that localizes."""
         return self._engine
 
     @property
@@ -107,15 +107,15 @@ class Attempts:
 
     def _attempt(self, job: Job, interrupted: Callable[[], bool]) -> JobResult:
         """Localize an image, and report once what came of it, whatever happens."""
-        trace = ""
+        stack = ""
         try:
             result = self._localize(job, interrupted)
         except Interrupted:
             raise
         except Exception as error:
             # Not foreseen: a bug, or out of memory. The next image may well do.
-            result, trace = JobResult(Outcome.error(error)), traceback.format_exc()
-        self._report.publish_attempt(job.message.header.stamp, result.outcome, trace)
+            result, stack = JobResult(Outcome.error(error)), traceback.format_exc()
+        self._report.publish_attempt(job.message.header.stamp, result.outcome, stack)
         return result
 
     def _localize(self, job: Job, interrupted: Callable[[], bool]) -> JobResult:

@@ -52,7 +52,7 @@ class LocalizerNode(LifecycleNode):
 
     @property
     def autostart(self) -> bool:
-        """Whether to configure and activate without being told to."""
+        """Whether to configure and activate at once, without a lifecycle manager."""
         return self._settings.node.autostart
 
     @property

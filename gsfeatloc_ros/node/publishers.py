@@ -38,7 +38,7 @@ class Extrinsics:
 
 
 class Publishers:
-    """Publish on the topics pose, rendered_image and debug_image, and the transform from the map to the odometry.
+    """Publishes on the topics pose, rendered_image and debug_image, and the transform from the map to the odometry.
 
     Args:
         node: whose they are.

@@ -65,14 +65,14 @@ class Reception:
         return [subscription.topic_name for subscription in self._subscriptions]
 
     def listen(self) -> None:
-        """Begin to listen."""
+        """Subscribe to all topics."""
         self._subscribe(self._image_topic, self._on_image)
         topics = (*_TOPICS, _ODOMETRY_TOPIC) if self._settings.node.track else _TOPICS
         for topic, kind in topics:
             self._subscribe(topic, partial(self._on_input, kind))
 
     def stop_listening(self) -> None:
-        """Stop to listen, and forget the newest image."""
+        """Unsubscribe, and forget the newest image."""
         for subscription in self._subscriptions:
             self._node.destroy_subscription(subscription)
         self._subscriptions = []

@@ -68,7 +68,7 @@ class Session:
 
     @property
     def engine(self) -> Engine:
-        """That localizes."""
+        """The engine that localizes."""
         return self.attempts.engine
 
     def activate(self) -> None:

@@ -125,7 +125,7 @@ class Inputs:
             raise
 
     def invalidate(self, topic: InputTopic, problem: str) -> None:
-        """Let there be nothing of a topic, for its newest message cannot be used. Odometry just lacks that message."""
+        """Forget the older message of a topic, for its newest cannot be used; older odometry still counts."""
         if topic is InputTopic.CAMERA_INFO:
             self._camera = _Newest(problem=problem)
         elif topic in (InputTopic.PRIOR, InputTopic.INITIAL_POSE):
