@@ -86,7 +86,7 @@ class Camera:
         return self.model == "equidistant" or bool(self.distortion.any())
 
     def pinhole(self) -> Camera:
-        """The camera with the same K that does not distort."""
+        """Return the camera with the same K that does not distort."""
         return replace(self, distortion=np.zeros(0), model="plumb_bob")
 
     def undistort(self, pixels: np.ndarray) -> np.ndarray:
@@ -103,7 +103,7 @@ class Camera:
         return undistorted.reshape(-1, 2)
 
     def undistort_image(self, image: np.ndarray) -> np.ndarray:
-        """The image (H, W, C) that a pinhole camera with the same K would take; black where the lens saw nothing."""
+        """Return the image (H, W, C) of a pinhole camera with the same K; it is black where the lens saw nothing."""
         if not self.distorted:
             return image
         if self.model == "equidistant":
@@ -115,11 +115,11 @@ class Camera:
         return self.distortion if len(self.distortion) else np.zeros(4)
 
     def project(self, points: np.ndarray) -> np.ndarray:
-        """Pinhole pixels (N, 2), without distortion, of camera-frame points (N, 3) with z > 0."""
+        """Project camera-frame points (N, 3) with z > 0 to pinhole pixels (N, 2), without distortion."""
         homogeneous = points @ self.K.T
         return homogeneous[:, :2] / homogeneous[:, 2:]
 
     def rays(self, pixels: np.ndarray) -> np.ndarray:
-        """Camera-frame directions (N, 3) with z = 1 through undistorted pixels (N, 2)."""
+        """Return the camera-frame directions (N, 3) with z = 1 through undistorted pixels (N, 2)."""
         homogeneous = np.column_stack([pixels, np.ones(len(pixels))])
         return homogeneous @ np.linalg.inv(self.K).T

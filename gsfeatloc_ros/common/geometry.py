@@ -31,7 +31,7 @@ def transform(pose: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def skew(vector: np.ndarray) -> np.ndarray:
-    """Cross-product matrices (..., 3, 3) of vectors (..., 3): ``skew(a) @ b == cross(a, b)``."""
+    """Return the cross-product matrices (..., 3, 3) of vectors (..., 3): ``skew(a) @ b == cross(a, b)``."""
     x, y, z = np.moveaxis(np.asarray(vector, dtype=np.float64), -1, 0)
     zero = np.zeros_like(x)
     rows = [[zero, -z, y], [z, zero, -x], [-y, x, zero]]
@@ -39,7 +39,7 @@ def skew(vector: np.ndarray) -> np.ndarray:
 
 
 def so3_exp(rotation_vector: np.ndarray) -> np.ndarray:
-    """Rotation matrix (3, 3) of a rotation vector (3,) in radians (Rodrigues' formula)."""
+    """Return the rotation matrix (3, 3) of a rotation vector (3,) in radians (Rodrigues' formula)."""
     angle = np.linalg.norm(rotation_vector)
     cross = skew(rotation_vector)
     if angle < _SMALL_ANGLE:
@@ -48,7 +48,7 @@ def so3_exp(rotation_vector: np.ndarray) -> np.ndarray:
 
 
 def so3_log(rotation: np.ndarray) -> np.ndarray:
-    """Rotation vector (3,) in radians, of norm at most pi, of a rotation matrix (3, 3)."""
+    """Return the rotation vector (3,) in radians, of norm at most pi, of a rotation matrix (3, 3)."""
     x, y, z, w = quaternion_from_matrix(rotation)
     sine = np.sqrt(x * x + y * y + z * z)
     scale = 2.0 / w if sine < _SMALL_ANGLE else 2.0 * np.arctan2(sine, w) / sine
@@ -56,7 +56,7 @@ def so3_log(rotation: np.ndarray) -> np.ndarray:
 
 
 def matrix_from_quaternion(quaternion: np.ndarray) -> np.ndarray:
-    """Rotation matrix (3, 3) of a quaternion (4,) xyzw of any positive norm.
+    """Return the rotation matrix (3, 3) of a quaternion (4,) xyzw of any positive norm.
 
     Raises:
         ValueError: the quaternion is not finite or its norm is (nearly) zero.
@@ -76,7 +76,7 @@ def matrix_from_quaternion(quaternion: np.ndarray) -> np.ndarray:
 
 
 def quaternion_from_matrix(rotation: np.ndarray) -> np.ndarray:
-    """Unit quaternion (4,) xyzw with w >= 0 of a rotation matrix (3, 3) (Shepperd's method, 1978)."""
+    """Return the unit quaternion (4,) xyzw with w >= 0 of a rotation matrix (3, 3) (Shepperd's method, 1978)."""
     m = rotation
     # Four times the squared components; the largest is the safe one to divide by.
     squares = np.array(
@@ -100,21 +100,21 @@ def quaternion_from_matrix(rotation: np.ndarray) -> np.ndarray:
     return -q if q[3] < 0 else q
 
 
-def interpolate(pose_a: np.ndarray, pose_b: np.ndarray, share: float) -> np.ndarray:
-    """The pose (4, 4) at `share` of the way from one pose to another: straight, and turning evenly about one axis."""
+def interpolate(pose_a: np.ndarray, pose_b: np.ndarray, fraction: float) -> np.ndarray:
+    """Return the pose (4, 4) at a fraction of the way from one to another: straight, turning evenly about one axis."""
     turn = so3_log(pose_a[:3, :3].T @ pose_b[:3, :3])
-    translation = (1 - share) * pose_a[:3, 3] + share * pose_b[:3, 3]
-    return make_pose(pose_a[:3, :3] @ so3_exp(share * turn), translation)
+    translation = (1 - fraction) * pose_a[:3, 3] + fraction * pose_b[:3, 3]
+    return make_pose(pose_a[:3, :3] @ so3_exp(fraction * turn), translation)
 
 
 def rotate_covariance(covariance: np.ndarray, rotation: np.ndarray) -> np.ndarray:
-    """Covariance (6, 6) of a pose about the axes of frame a, from that about the axes of frame b and R_a_b (3, 3)."""
+    """Turn the covariance (6, 6) of a pose from the axes of frame b to those of frame a, by R_a_b (3, 3)."""
     both = np.kron(np.eye(2), rotation)
     return both @ covariance @ both.T
 
 
 def shift_covariance(covariance: np.ndarray, lever: np.ndarray) -> np.ndarray:
-    """Covariance (6, 6) of the pose of another point of the same body.
+    """Return the covariance (6, 6) of the pose of another point of the same body.
 
     To first order: a small rotation w moves the point at `lever` by w x lever.
 
@@ -128,16 +128,16 @@ def shift_covariance(covariance: np.ndarray, lever: np.ndarray) -> np.ndarray:
 
 
 def random_unit_vector(rng: np.random.Generator) -> np.ndarray:
-    """Direction (3,) uniform on the sphere."""
+    """Draw a direction (3,) uniform on the sphere."""
     vector = rng.normal(size=3)
     return vector / np.linalg.norm(vector)
 
 
 def rotation_error_deg(pose_a: np.ndarray, pose_b: np.ndarray) -> float:
-    """Angle in degrees between the rotations of two poses (4, 4)."""
+    """Return the angle in degrees between the rotations of two poses (4, 4)."""
     return float(np.degrees(np.linalg.norm(so3_log(pose_a[:3, :3].T @ pose_b[:3, :3]))))
 
 
 def translation_error(pose_a: np.ndarray, pose_b: np.ndarray) -> float:
-    """Distance between the origins of two poses (4, 4), in the units of their frame."""
+    """Return the distance between the origins of two poses (4, 4), in the units of their frame."""
     return float(np.linalg.norm(pose_a[:3, 3] - pose_b[:3, 3]))

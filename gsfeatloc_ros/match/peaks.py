@@ -7,14 +7,18 @@ import functools
 import torch
 from kornia.geometry.subpix import nms2d
 
-_WINDOW = 5
+_PEAK_WINDOW = 5  # pixels: a peak is the highest in it
 # x, y of the pixels of a 3x3 window.
 _OFFSETS = torch.tensor([(dx, dy) for dy in (-1, 0, 1) for dx in (-1, 0, 1)])
 
 
 def find_peaks(heatmap: torch.Tensor, threshold: float, max_peaks: int) -> torch.Tensor:
     """Find the highest of a heatmap's (H, W) local maxima over `threshold`: (N, 2) int64 x, y, the highest first."""
-    y, x = (nms2d(heatmap[None, None], (_WINDOW, _WINDOW), mask_only=True)[0, 0] & (heatmap > threshold)).nonzero().T
+    y, x = (
+        (nms2d(heatmap[None, None], (_PEAK_WINDOW, _PEAK_WINDOW), mask_only=True)[0, 0] & (heatmap > threshold))
+        .nonzero()
+        .T
+    )
     order = heatmap[y, x].argsort(descending=True)[:max_peaks]
     return torch.stack([x[order], y[order]], dim=1)
 
@@ -52,12 +56,12 @@ def centroid(peaks: torch.Tensor, heatmap: torch.Tensor) -> torch.Tensor:
 
 
 def cell_heatmap(logits: torch.Tensor) -> torch.Tensor:
-    """Heatmap (H, W) of a head that classifies: logits (1, 65, H/8, W/8) for the pixels of a cell and "none"."""
+    """Return the heatmap (H, W) of a head that classifies: logits (1, 65, H/8, W/8) for a cell's pixels and "none"."""
     return torch.nn.functional.pixel_shuffle(logits.softmax(dim=1)[:, :64], 8)[0, 0]
 
 
 def _windows(peaks: torch.Tensor, heatmap: torch.Tensor) -> torch.Tensor:
-    """The 3x3 windows (N, 9) round peaks; what is outside repeats the border."""
+    """Return the 3x3 windows (N, 9) round peaks; what is outside repeats the border."""
     padded = torch.nn.functional.pad(heatmap[None, None], (1, 1, 1, 1), mode="replicate")[0, 0]
     x, y = peaks.T
     dx, dy = _offsets(peaks.device).T
@@ -71,7 +75,7 @@ def _offsets(device: torch.device) -> torch.Tensor:
 
 @functools.cache
 def _quadratic_fit(device: torch.device) -> torch.Tensor:
-    """(9, 6): by this the windows' values give the coefficients of xx, yy, xy, x, y and 1."""
+    """Return the matrix (9, 6) by which the windows' values give the coefficients of xx, yy, xy, x, y and 1."""
     x, y = _OFFSETS.float().T
     terms = torch.stack([x * x, y * y, x * y, x, y, torch.ones_like(x)], dim=1)
     return torch.linalg.pinv(terms).T.to(device)

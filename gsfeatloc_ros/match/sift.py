@@ -10,7 +10,8 @@ from gsfeatloc_ros.match.base import Features, Matches
 from gsfeatloc_ros.match.nearest import match_mutual
 
 # Renders are smoother than photos: SIFT's usual threshold of 0.04 leaves too few features in them.
-CONTRAST_THRESHOLD = 0.01
+MIN_CONTRAST = 0.01
+# Of Lowe's test: distance to the nearest descriptor over that to the second nearest.
 MAX_RATIO = 0.85
 
 
@@ -19,8 +20,8 @@ class Sift:
 
     def __init__(self, max_features: int) -> None:
         # Precise upscaling: without it keypoints are a quarter of a pixel off.
-        self._sift = cv2.SIFT_create(
-            nfeatures=max_features, contrastThreshold=CONTRAST_THRESHOLD, enable_precise_upscale=True
+        self._sift = cv2.SIFT.create(
+            nfeatures=max_features, contrastThreshold=MIN_CONTRAST, enable_precise_upscale=True
         )
 
     def features(self, image: Array) -> Features:
@@ -30,7 +31,9 @@ class Sift:
             return Features.none(128)
         descriptors = np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-9))
         return Features(
-            cv2.KeyPoint.convert(keypoints), descriptors, np.array([k.response for k in keypoints], dtype=np.float32)
+            np.asarray(cv2.KeyPoint.convert(keypoints)),
+            descriptors,
+            np.array([k.response for k in keypoints], dtype=np.float32),
         )
 
     def match(self, a: Features, b: Features) -> Matches:

@@ -13,12 +13,13 @@ from functools import lru_cache
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 from torch.nn import functional
 
 from gsfeatloc_ros.common.arrays import Array, to_device
 from gsfeatloc_ros.match.base import Features, Matches
 from gsfeatloc_ros.match.nearest import match_mutual
-from gsfeatloc_ros.match.sift import CONTRAST_THRESHOLD, MAX_RATIO
+from gsfeatloc_ros.match.sift import MAX_RATIO, MIN_CONTRAST
 from gsfeatloc_ros.match.tensor import LUMA
 
 # Scale space: the image, enlarged twofold, has the first blur; every octave begins at the second and doubles it in so
@@ -27,33 +28,33 @@ _IMAGE_SIGMA = 1.0
 _SIGMA = 1.6
 _LAYERS = 3
 _BLURS = _LAYERS + 3
-_RADIUS = 20  # of the blurs, four deviations of the widest
+_BLUR_RADIUS = 20  # of the blurs, four deviations of the widest
 
 # Extrema: contrast in gray levels; ratio of the principal curvatures of an edge; pixels of the octave.
-_MIN_CONTRAST = CONTRAST_THRESHOLD * 255 / _LAYERS
+_MIN_GRAY_CONTRAST = MIN_CONTRAST * 255 / _LAYERS
 _MAX_EDGE_RATIO = 10.0
-_BORDER = 5
+_OCTAVE_BORDER = 5
 # How many are refined for each feature that is wanted, as many turn out to be edges, and how often they are moved.
-_CANDIDATES = 4
-_MOVES = 2
+_CANDIDATES_PER_FEATURE = 4
+_MAX_MOVES = 2
 
 # Orientation: the gradients in a Gaussian window of 1.5 scales, seen to three deviations.
 _WINDOW_SIGMA = 1.5
 _WINDOW_SAMPLES = 15
 _WINDOW_BINS = 36
-_MIN_PEAK = 0.8
+_MIN_PEAK_RATIO = 0.8
 # Added up as whole numbers of this many gray levels: a GPU adds in any order, and sums of floats would differ.
 _GRADIENT_UNIT = 1e-4
 
 # Descriptor: 4x4 cells of three scales; gradients within half a cell round them count.
 _CELLS = 4
-_CELL = 3.0
+_CELL_SIZE = 3.0
 _CELL_BINS = 8
 _CELL_SAMPLES = 3
-_MAX_SHARE = 0.2
+_MAX_COMPONENT = 0.2
 
 # Steps (27, 3) in x, y and layer from a voxel of the scale space to those round it.
-_STEPS = np.array([(x, y, layer) for layer in (-1, 0, 1) for y in (-1, 0, 1) for x in (-1, 0, 1)])
+_NEIGHBOUR_STEPS = np.array([(x, y, layer) for layer in (-1, 0, 1) for y in (-1, 0, 1) for x in (-1, 0, 1)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,10 +89,10 @@ class _Atlas:
 
     @staticmethod
     def of(height: int, width: int, device: str) -> _Atlas:
-        """For images of this size; without octaves where it is too small for any."""
+        """Make the atlas for images of this size; without octaves where it is too small for any."""
         sizes = []
         height, width = 2 * height - 1, 2 * width - 1
-        while min(height, width) > 2 * _BORDER:
+        while min(height, width) > 2 * _OCTAVE_BORDER:
             sizes.append((height, width))
             height, width = (height + 1) // 2, (width + 1) // 2
         origins, below = [(0, 0)], 0
@@ -101,13 +102,14 @@ class _Atlas:
         slices = [
             (slice(y, y + rows), slice(x, x + columns)) for (y, x), (rows, columns) in zip(origins, sizes, strict=False)
         ]
-        shape = tuple(max((place[axis].stop for place in slices), default=0) for axis in (0, 1))
+        rows, columns = (max((place[axis].stop for place in slices), default=0) for axis in (0, 1))
+        shape = (rows, columns)
         octave = np.zeros(shape, np.int64)
         inside = np.zeros((_LAYERS + 2, *shape), bool)
         interior = np.zeros(shape, np.float32)
         for index, place in enumerate(slices):
             octave[place] = index
-            inside[1:-1][:, *place][:, _BORDER:-_BORDER, _BORDER:-_BORDER] = True
+            inside[1:-1][:, *place][:, _OCTAVE_BORDER:-_OCTAVE_BORDER, _OCTAVE_BORDER:-_OCTAVE_BORDER] = True
             interior[place][1:-1, 1:-1] = 1
         strides = np.array([1, shape[1], shape[0] * shape[1]])
         corners = np.array([[x.start, y.start] for y, x in slices], np.float32).reshape(-1, 2)
@@ -119,7 +121,7 @@ class _Atlas:
             octave.ravel(),
             inside,
             interior,
-            _STEPS @ strides,
+            _NEIGHBOUR_STEPS @ strides,
             strides,
             2 / (np.array([shape[1], _LAYERS * shape[0]], np.float32) - 1),
         )
@@ -146,7 +148,7 @@ class _Keypoints:
     scores: torch.Tensor
 
     def select(self, index: torch.Tensor) -> _Keypoints:
-        """Those that indices (M,) name."""
+        """Return the keypoints that indices (M,) name."""
         return _Keypoints(*(getattr(self, field.name)[index] for field in fields(self)))
 
 
@@ -154,11 +156,11 @@ class GpuSift:
     """SIFT features, matched by mutual nearest neighbours and the ratio test. Needs no weights."""
 
     def __init__(self, max_features: int, device: str) -> None:
-        """`device` is torch's; what is found stays there."""
+        """Prepare constants on `device`, which is torch's; what is found stays there."""
         self._max_features = max_features
         self._device = device
 
-        def constant(values: np.ndarray) -> torch.Tensor:
+        def constant(values: ArrayLike) -> torch.Tensor:
             return torch.tensor(values, dtype=torch.float32, device=device)
 
         self._luma = constant(LUMA)
@@ -198,7 +200,7 @@ class GpuSift:
         )
 
     def _gaussians(self, gray: torch.Tensor, atlas: _Atlas) -> torch.Tensor:
-        """Blurred images of all octaves: (BLURS, H, W) of the atlas, from the brightness of the image."""
+        """Blur the brightness of the image to all octaves: (BLURS, H, W) of the atlas."""
         first = atlas.slices[0]
         size = [place.stop for place in first]
         # Aligned at the corners, and of an odd size: the pixels of the image stay where they are, at even ones.
@@ -213,18 +215,20 @@ class GpuSift:
         return gaussians
 
     def _find(self, differences: torch.Tensor, atlas: _Atlas) -> _Keypoints:
-        """The extrema of differences of Gaussians (LAYERS + 2, H, W), the strongest first."""
+        """Find the extrema of differences of Gaussians (LAYERS + 2, H, W), the strongest first."""
         # Bright and dark ones: maxima of the differences and of their negatives.
         signed = torch.stack([differences, -differences])
         highest = functional.max_pool2d(signed, 3, stride=1, padding=1)
         below, same, above = (highest[:, layer : layer + _LAYERS] for layer in range(3))
         middle = signed[:, 1:-1]
-        extreme = (middle == same.maximum(below).maximum(above)) & (middle > 0.5 * _MIN_CONTRAST) & atlas.inside[1:-1]
+        extreme = (
+            (middle == same.maximum(below).maximum(above)) & (middle > 0.5 * _MIN_GRAY_CONTRAST) & atlas.inside[1:-1]
+        )
         strength = torch.where(extreme, middle, 0.0).amax(dim=0).flatten()
-        strength, start = strength.topk(min(_CANDIDATES * self._max_features, len(strength)))
+        strength, start = strength.topk(min(_CANDIDATES_PER_FEATURE * self._max_features, len(strength)))
         width, area = atlas.shape[1], atlas.shape[0] * atlas.shape[1]
         # What is none is sent to the first pixel that has all its neighbours.
-        start = torch.where(strength > 0, start, _BORDER * width + _BORDER) + area
+        start = torch.where(strength > 0, start, _OCTAVE_BORDER * width + _OCTAVE_BORDER) + area
         voxel, offset, contrast, good = self._refine(differences.flatten(), start, atlas)
         # One that moved to the place of another is that one.
         valid = good & (strength > 0) & ((voxel == start) | ~extreme.any(dim=0).flatten()[voxel - area])
@@ -255,18 +259,18 @@ class GpuSift:
         """
         inside = atlas.inside.flatten()
         offset, derivatives = self._fit(differences, voxel, atlas)
-        for _ in range(_MOVES):
+        for _ in range(_MAX_MOVES):
             moved = voxel + (offset.nan_to_num(0.0).clamp(-1, 1).round().long() * atlas.strides).sum(dim=1)
             voxel = torch.where(inside[moved], moved, voxel)
             offset, derivatives = self._fit(differences, voxel, atlas)
         contrast = (differences[voxel] + 0.5 * (derivatives[:, :3] * offset).sum(dim=1)).abs()
         xx, xy, yy = derivatives[:, 3], derivatives[:, 4], derivatives[:, 7]
         sharp = (xx + yy) ** 2 * _MAX_EDGE_RATIO < (_MAX_EDGE_RATIO + 1) ** 2 * (xx * yy - xy**2)
-        good = sharp & (contrast >= _MIN_CONTRAST) & (offset.abs() < 0.5).all(dim=1)
+        good = sharp & (contrast >= _MIN_GRAY_CONTRAST) & (offset.abs() < 0.5).all(dim=1)
         return voxel, torch.where(good[:, None], offset, 0.0), contrast, good
 
     def _fit(self, differences: torch.Tensor, voxel: torch.Tensor, atlas: _Atlas) -> tuple[torch.Tensor, torch.Tensor]:
-        """Offsets (N, 3) from voxels to the extrema of their quadratics; gradients and Hessians of those (N, 3 + 9)."""
+        """Return offsets (N, 3) from voxels to their quadratics' extrema; gradients and Hessians (N, 3 + 9)."""
         derivatives = differences[voxel[:, None] + atlas.neighbours] @ self._derivatives
         gradient, hessian = derivatives[:, :3], derivatives[:, 3:].view(-1, 3, 3)
         # By Cramer's rule: torch.linalg.solve would wait to see that none is singular.
@@ -275,7 +279,7 @@ class GpuSift:
         return -(adjugate @ gradient[..., None])[..., 0] / determinant, derivatives
 
     def _orient(self, keypoints: _Keypoints, gradients: torch.Tensor, atlas: _Atlas) -> tuple[_Keypoints, torch.Tensor]:
-        """The keypoints that there are, once for each orientation, and those (N,): radians from x to y."""
+        """Return the keypoints that there are, once for each orientation, and those (N,): radians from x to y."""
         places = keypoints.places[:, None] + keypoints.sigma[:, None] * self._window_offsets
         strength, angle = _sample(gradients, places, keypoints, atlas)
         bins = (angle * (_WINDOW_BINS / math.tau)).round().long().remainder(_WINDOW_BINS)
@@ -284,7 +288,7 @@ class GpuSift:
         histogram = sums.float() @ self._smoothing
         before, after = histogram.roll(1, 1), histogram.roll(-1, 1)
         peaks, at = torch.where((histogram > before) & (histogram > after), histogram, 0.0).topk(2)
-        valid = (peaks > 0) & (peaks >= _MIN_PEAK * peaks[:, :1]) & (keypoints.scores > 0)[:, None]
+        valid = (peaks > 0) & (peaks >= _MIN_PEAK_RATIO * peaks[:, :1]) & (keypoints.scores > 0)[:, None]
         before, after = before.gather(1, at), after.gather(1, at)
         angles = (at + 0.5 * (before - after) / (before - 2 * peaks + after)) * (math.tau / _WINDOW_BINS)
         # The one wait for the device: how many there are.
@@ -294,7 +298,7 @@ class GpuSift:
     def _describe(
         self, keypoints: _Keypoints, angles: torch.Tensor, gradients: torch.Tensor, atlas: _Atlas
     ) -> torch.Tensor:
-        """Descriptors (N, 128) of keypoints turned by angles (N,)."""
+        """Describe keypoints turned by angles (N,): (N, 128)."""
         cos, sin = angles.cos(), angles.sin()
         axes = torch.stack([cos, sin, -sin, cos], dim=1).view(-1, 2, 2) * keypoints.sigma[..., None]
         strength, angle = _sample(gradients, keypoints.places[:, None] + self._cell_offsets @ axes, keypoints, atlas)
@@ -304,20 +308,20 @@ class GpuSift:
         apart = ((direction[:, None] - self._cell_bins + half).remainder(_CELL_BINS) - half).abs()
         weights = functional.relu(1 - apart) * strength[:, None]
         descriptors = (weights @ self._cell_weights).transpose(1, 2).flatten(1)
-        descriptors = functional.normalize(descriptors).clamp(max=_MAX_SHARE)
+        descriptors = functional.normalize(descriptors).clamp(max=_MAX_COMPONENT)
         return functional.normalize(descriptors, p=1.0).sqrt()
 
 
 def _blur(image: torch.Tensor, kernels: torch.Tensor) -> torch.Tensor:
     """Blur an image (1, 1, H, W) by kernels (B, 1, 1, K) along both axes: (B, H, W)."""
     # With as many groups as channels torch convolves in full float32, where cuDNN would round to TF32.
-    padded = functional.pad(image, (_RADIUS,) * 4, mode="replicate").expand(-1, _BLURS, -1, -1)
+    padded = functional.pad(image, (_BLUR_RADIUS,) * 4, mode="replicate").expand(-1, _BLURS, -1, -1)
     blurred = functional.conv2d(padded, kernels, groups=_BLURS)
     return functional.conv2d(blurred, kernels.transpose(2, 3), groups=_BLURS)[0]
 
 
 def _gradients(gaussians: torch.Tensor, atlas: _Atlas) -> torch.Tensor:
-    """Central differences along x and y of pictures (L, H, W), one below the other: (1, 2, L * H, W).
+    """Return central differences along x and y of pictures (L, H, W), one below the other: (1, 2, L * H, W).
 
     They are 0 at the borders of octaves and beyond.
     """
@@ -330,7 +334,7 @@ def _gradients(gaussians: torch.Tensor, atlas: _Atlas) -> torch.Tensor:
 def _sample(
     gradients: torch.Tensor, places: torch.Tensor, keypoints: _Keypoints, atlas: _Atlas
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Lengths and angles (N, S) of the gradients at places (N, S, 2) round keypoints (N)."""
+    """Return lengths and angles (N, S) of the gradients at places (N, S, 2) round keypoints (N)."""
     # Beyond the octave as at its border, where they are 0.
     places = places.clamp(keypoints.near[:, None], keypoints.far[:, None])
     x, y = functional.grid_sample(gradients, places[None] * atlas.to_grid - 1, align_corners=True)[0]
@@ -338,19 +342,19 @@ def _sample(
 
 
 def _blur_kernels(sigma: float) -> np.ndarray:
-    """Gaussians (BLURS, 1, 1, K) that make the images of an octave of one that has the blur `sigma`."""
+    """Return the Gaussians (BLURS, 1, 1, K) that make the images of an octave of one that has the blur `sigma`."""
     variances = (_SIGMA * 2 ** (np.arange(_BLURS) / _LAYERS)) ** 2 - sigma**2
-    x = np.arange(-_RADIUS, _RADIUS + 1)
+    x = np.arange(-_BLUR_RADIUS, _BLUR_RADIUS + 1)
     kernels = np.exp(-0.5 * x**2 / np.maximum(variances, 1e-6)[:, None])
     return (kernels / kernels.sum(axis=1, keepdims=True))[:, None, None]
 
 
 def _derivatives() -> np.ndarray:
-    """Matrix (27, 12) that makes the gradient (3) and the Hessian (3, 3) of the values (27) round a voxel."""
+    """Return the matrix (27, 12) that makes gradient (3) and Hessian (3, 3) of the values (27) round a voxel."""
     axes = list(np.eye(3, dtype=int))
 
     def value(step: np.ndarray) -> np.ndarray:
-        return (step == _STEPS).all(axis=1).astype(float)
+        return (step == _NEIGHBOUR_STEPS).all(axis=1).astype(float)
 
     gradient = [(value(a) - value(-a)) / 2 for a in axes]
     hessian = [
@@ -364,26 +368,24 @@ def _derivatives() -> np.ndarray:
 
 
 def _window() -> tuple[np.ndarray, np.ndarray]:
-    """Where the gradients that give the orientation are, (S, 2) in scales, and their weights (S,)."""
+    """Return where the gradients that give the orientation are, (S, 2) in scales, and their weights (S,)."""
     line = np.linspace(-3 * _WINDOW_SIGMA, 3 * _WINDOW_SIGMA, _WINDOW_SAMPLES)
     offsets = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
     return offsets, np.exp(-0.5 * (offsets**2).sum(axis=1) / _WINDOW_SIGMA**2)
 
 
 def _smoothing() -> np.ndarray:
-    """Circulant matrix (36, 36) that smooths a histogram of directions."""
-    return sum(
-        weight * np.roll(np.eye(_WINDOW_BINS), shift, axis=1)
-        for shift, weight in zip(range(-2, 3), np.array([1, 4, 6, 4, 1]) / 16, strict=True)
-    )
+    """Return the circulant matrix (36, 36) that smooths a histogram of directions."""
+    weights = zip(range(-2, 3), np.array([1, 4, 6, 4, 1]) / 16, strict=True)
+    return np.sum([weight * np.roll(np.eye(_WINDOW_BINS), shift, axis=1) for shift, weight in weights], axis=0)
 
 
 def _cells() -> tuple[np.ndarray, np.ndarray]:
-    """Where the gradients of a descriptor are, (S, 2) in scales, and their weights in its cells (S, 16)."""
+    """Return where the gradients of a descriptor are, (S, 2) in scales, and their weights in its cells (S, 16)."""
     reach = _CELLS / 2 + 0.5
     count = int(2 * reach * _CELL_SAMPLES)
     line = (np.arange(count) + 0.5) / _CELL_SAMPLES - reach
     centers = np.arange(_CELLS) - (_CELLS - 1) / 2
     share = np.maximum(1 - np.abs(line[:, None] - centers), 0) * np.exp(-0.5 * (line[:, None] / (_CELLS / 2)) ** 2)
     offsets = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
-    return _CELL * offsets, np.kron(share, share)
+    return _CELL_SIZE * offsets, np.kron(share, share)

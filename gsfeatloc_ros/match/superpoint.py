@@ -8,6 +8,7 @@ when Hugging Face or LightGlue pass them on.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import torch
 from kornia.color import rgb_to_grayscale
@@ -16,7 +17,7 @@ from gsfeatloc_ros.common.arrays import Array
 from gsfeatloc_ros.match.base import Matches
 from gsfeatloc_ros.match.lightglue import PlacedFeatures
 from gsfeatloc_ros.match.peaks import cell_heatmap, centroid
-from gsfeatloc_ros.match.tensor import to_matches, to_tensor
+from gsfeatloc_ros.match.tensor import as_tensor, to_matches, to_tensor
 from gsfeatloc_ros.match.weights import WeightsError
 
 # Matcher: its class in transformers, and the model on Hugging Face's hub.
@@ -78,9 +79,9 @@ class SuperPointMatcher:
         """Match the features of two images."""
         if len(a) == 0 or len(b) == 0:
             return Matches.none()
-        keypoints = _pair(a.keypoints, b.keypoints)
-        descriptors = _pair(a.descriptors, b.descriptors)
-        scores = _pair(a.scores, b.scores)
+        keypoints = _pair(as_tensor(a.keypoints), as_tensor(b.keypoints))
+        descriptors = _pair(as_tensor(a.descriptors), as_tensor(b.descriptors))
+        scores = _pair(as_tensor(a.scores), as_tensor(b.scores))
         mask = _pair(*(torch.ones(len(features), dtype=torch.int32, device=self._device) for features in (a, b)))
         width, height = map(max, a.size, b.size)
         # Of forward(), the part after extraction: it takes images, and would extract the photo's features every time.
@@ -96,8 +97,8 @@ def _pair(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     return torch.nn.utils.rnn.pad_sequence([a, b], batch_first=True)[None]
 
 
-def _load(class_name: str, name: str) -> torch.nn.Module:
-    """Load a model of Hugging Face from a folder, the hub's cache or the hub."""
+def _load(class_name: str, name: str) -> Any:
+    """Load a model of Hugging Face, whose classes are not typed, from a folder, the hub's cache or the hub."""
     try:
         import transformers
         from huggingface_hub.constants import HF_HUB_CACHE

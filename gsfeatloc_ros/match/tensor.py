@@ -11,8 +11,14 @@ from gsfeatloc_ros.match.base import Features, Matches
 LUMA = (0.299, 0.587, 0.114)
 
 
+def as_tensor(array: Array) -> torch.Tensor:
+    """Return what is known to be a tensor, such as features that were found in torch."""
+    assert isinstance(array, torch.Tensor)
+    return array
+
+
 def is_blank(image: Array) -> bool:
-    """Whether an RGB image (H, W, 3) has one colour: networks that normalize contrast find something even in that."""
+    """Return whether an RGB image (H, W, 3) has one colour: networks that normalize contrast find something in it."""
     return bool((image == image[0, 0]).all())
 
 
@@ -28,8 +34,9 @@ def to_tensor(image: Array, device: str, multiple: int = 1) -> torch.Tensor:
 
 
 def to_matches(a: Features, b: Features, index_a: torch.Tensor, index_b: torch.Tensor, scores: torch.Tensor) -> Matches:
-    """Matches between the features `index_a` (M,) of `a` and `index_b` (M,) of `b`, with scores (M,)."""
+    """Return the matches between features `index_a` (M,) of `a` and `index_b` (M,) of `b`, with scores (M,)."""
     # In one copy, as each waits for the device.
-    columns = torch.column_stack([a.keypoints[index_a], b.keypoints[index_b], scores])
+    keypoints_a, keypoints_b = as_tensor(a.keypoints), as_tensor(b.keypoints)
+    columns = torch.column_stack([keypoints_a[index_a], keypoints_b[index_b], scores])
     numbers = columns.cpu().double().numpy()
     return Matches(numbers[:, :2], numbers[:, 2:4], numbers[:, 4])

@@ -5,25 +5,26 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from gsfeatloc_ros.common.arrays import Array, to_host
 from gsfeatloc_ros.common.local_structure import local_structure
 from gsfeatloc_ros.common.photo import Photo
 from gsfeatloc_ros.match.base import Matches
 
-# Corners (Shi and Tomasi, 1994): at most this many, at least so many pixels apart, and of at least this share of the
-# strongest one's strength.
+# Corners (Shi and Tomasi, 1994): how many, how many pixels apart, of what part of the strongest one's strength, and
+# over a block of how many pixels a side that is measured.
 MAX_CORNERS = 800
-DISTANCE = 7
-QUALITY = 0.005
+MIN_CORNER_DISTANCE = 7
+MIN_CORNER_QUALITY = 0.005
 CORNER_BLOCK = 5
-# The images that are compared: local structure, its zero in the middle of the range of a byte.
-NEIGHBOURHOOD = 12.0
-MIN_CONTRAST = 8.0
-GAIN = 40.0
-# Lucas-Kanade on a pyramid of four levels.
-WINDOW = (15, 15)
-LEVELS = 3
-_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.01)
-# A corner that is followed to the render and back must return to within this many pixels.
+# The images that are compared: local structure (common/local_structure.py), its zero in the middle of a byte's range.
+STRUCTURE_SIGMA = 12.0
+STRUCTURE_MIN_CONTRAST = 8.0
+STRUCTURE_GAIN = 40.0
+# Lucas-Kanade on a pyramid whose levels are 0 to this, in windows of these pixels.
+FLOW_WINDOW = (15, 15)
+MAX_FLOW_LEVEL = 3
+_FLOW_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.01)
+# Of a corner that is followed to the render and back, in pixels.
 MAX_RETURN_ERROR = 1.0
 
 
@@ -41,18 +42,20 @@ class CornerTracker:
     def __init__(self, photo: Photo) -> None:
         gray = photo.gray()
         self._structure = _structure(gray)
-        mask = seen_off_the_border(photo)
-        corners = cv2.goodFeaturesToTrack(gray, MAX_CORNERS, QUALITY, DISTANCE, mask=mask, blockSize=CORNER_BLOCK)
-        self.corners = np.empty((0, 2), np.float32) if corners is None else corners.reshape(-1, 2)
+        seen = seen_off_the_border(photo)
+        corners = cv2.goodFeaturesToTrack(
+            gray, MAX_CORNERS, MIN_CORNER_QUALITY, MIN_CORNER_DISTANCE, mask=seen, blockSize=CORNER_BLOCK
+        )
+        self.corners: np.ndarray = np.empty((0, 2), np.float32) if corners is None else corners.reshape(-1, 2)
 
-    def track(self, image: np.ndarray) -> Matches:
+    def track(self, image: Array) -> Matches:
         """Find the photo's corners in a render (H, W, 3) uint8 RGB of its size.
 
         Corners that cannot be followed there and back are left out.
         """
         if len(self.corners) == 0:
             return Matches.none()
-        structure = _structure(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
+        structure = _structure(cv2.cvtColor(to_host(image), cv2.COLOR_RGB2GRAY))
         there, found = _flow(self._structure, structure, self.corners)
         back, found_back = _flow(structure, self._structure, there)
         kept = found & found_back & (np.linalg.norm(back - self.corners, axis=1) <= MAX_RETURN_ERROR)
@@ -61,18 +64,25 @@ class CornerTracker:
 
 
 def seen_off_the_border(photo: Photo) -> np.ndarray:
-    """Where corners are looked for, (H, W) uint8: the border of what the lens saw is no corner of the world."""
-    return cv2.erode(photo.seen.astype(np.uint8), np.ones(WINDOW, np.uint8))
+    """Return where to look for corners, (H, W) uint8: the border of what the lens saw is no corner of the world."""
+    return cv2.erode(photo.seen.astype(np.uint8), np.ones(FLOW_WINDOW, np.uint8))
 
 
 def _structure(gray: np.ndarray) -> np.ndarray:
-    structure, _ = local_structure(gray, NEIGHBOURHOOD, MIN_CONTRAST)
-    return np.clip(128 + GAIN * structure, 0, 255).astype(np.uint8)
+    """Return the local structure of brightness (H, W) uint8 as bytes (H, W)."""
+    structure, _ = local_structure(gray, STRUCTURE_SIGMA, STRUCTURE_MIN_CONTRAST)
+    return np.clip(128 + STRUCTURE_GAIN * structure, 0, 255).astype(np.uint8)
 
 
 def _flow(here: np.ndarray, there: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where pixels (N, 2) of one image are in another: (N, 2), and which were found (N,) bool."""
+    """Find where pixels (N, 2) of one image are in another: (N, 2), and which were found (N,) bool."""
     moved, found, _ = cv2.calcOpticalFlowPyrLK(
-        here, there, pixels, None, winSize=WINDOW, maxLevel=LEVELS, criteria=_CRITERIA
+        here,
+        there,
+        pixels,
+        np.empty_like(pixels),
+        winSize=FLOW_WINDOW,
+        maxLevel=MAX_FLOW_LEVEL,
+        criteria=_FLOW_CRITERIA,
     )
     return moved, found[:, 0] == 1

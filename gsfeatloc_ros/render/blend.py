@@ -1,5 +1,7 @@
 """Kernels 2 and 3 of a frame: gather the splats of each tile; sort them by depth and blend them into the images."""
 
+# Kernels take as many parameters as they need: render/kernels.py says why.
+
 from __future__ import annotations
 
 import math
@@ -49,7 +51,7 @@ _BATCH_SIZE = 64
 
 # State of a block's pixels. Depths count from the tile's nearest splat: the spread is a difference of squares.
 _TRANSMITTANCE, _COVERED, _RED, _GREEN, _BLUE, _MOMENT1, _MOMENT2, _MEDIAN = range(8)
-_STATE = 8 * LANES
+_STATE_SIZE = 8 * LANES
 
 _F = np.float32
 # With an unsigned index numba does not look for negative ones.
@@ -63,13 +65,13 @@ _NAN = _F(np.nan)
 _COLUMNS = np.tile(np.arange(BLOCK_SIZE, dtype=np.float32), BLOCK_SIZE)
 _ROWS = np.repeat(np.arange(BLOCK_SIZE, dtype=np.float32), BLOCK_SIZE)
 
-# A digit of the depth sort has at most so many bits.
+# Of a digit of the depth sort.
 _MAX_DIGIT_BITS = 9
 
 
 @njit(nogil=True, cache=True)
 def tile_starts(histogram):
-    """Where each tile's list starts: (tiles + 1,) int64. `histogram` becomes where each thread's part of it starts."""
+    """Return where each tile's list starts, (tiles + 1,) int64; set `histogram` to where each thread's part starts."""
     threads, tiles = histogram.shape
     starts = np.empty(tiles + 1, dtype=np.int64)
     total = 0
@@ -95,7 +97,7 @@ def gather(pair_tiles, pair_keys, pairs, positions, by_tile):
 
 @intrinsic
 def _take_next(typingctx, counter):
-    """counter[0], an int64 that threads share, which is then one more."""
+    """Return counter[0], an int64 that threads share, and add 1 to it."""
 
     def codegen(context, builder, signature, args):
         data = context.make_array(signature.args[0])(context, builder, args[0]).data
@@ -124,7 +126,7 @@ def blend(splats, by_tile, starts, threads, background, rgb, depth, median_depth
 
     for _worker in prange(threads):
         spare = np.empty(longest, dtype=np.uint64)
-        state = np.empty(_BLOCKS * _STATE, dtype=np.float32)
+        state = np.empty(_BLOCKS * _STATE_SIZE, dtype=np.float32)
         while True:
             tile = _take_next(counter)
             if tile >= tiles:
@@ -139,13 +141,13 @@ def blend(splats, by_tile, starts, threads, background, rgb, depth, median_depth
 
 @njit
 def _record(key):
-    """Where the record of the splat with this key is."""
+    """Return where the record of the splat with this key is."""
     return np.int64(key & np.uint64(0xFFFFFFFF)) * SPLAT_SIZE
 
 
 @njit
 def _sorted_by_depth(keys, spare):
-    """The keys sorted by their upper half, in place or in `spare`: a stable radix sort of the bits that differ."""
+    """Sort the keys by their upper half, in place or into `spare`: a stable radix sort of the bits that differ."""
     if len(keys) < 2:
         return keys
     shift = np.uint64(32)
@@ -180,10 +182,10 @@ def _sorted_by_depth(keys, spare):
 
 @njit
 def _blend_tile(splats, keys, x0, y0, nearest, state):
-    """Blend splats, nearest first, into the state (_BLOCKS, _STATE) of a tile whose first pixel is x0, y0."""
+    """Blend splats, nearest first, into the state (_BLOCKS, _STATE_SIZE) of a tile whose first pixel is x0, y0."""
     state[:] = _ZERO
     for block in range(_BLOCKS):
-        store(state, block * _STATE + _TRANSMITTANCE * LANES, broadcast(_ONE))
+        store(state, block * _STATE_SIZE + _TRANSMITTANCE * LANES, broadcast(_ONE))
     batch = np.empty(_BATCH_SIZE * SPLAT_SIZE, dtype=np.float32)
     members = np.empty(_BLOCKS, dtype=np.uint64)
     running = np.ones(_BLOCKS, dtype=np.bool_)
@@ -199,7 +201,7 @@ def _blend_tile(splats, keys, x0, y0, nearest, state):
         for block in range(_BLOCKS):
             if running[block]:
                 x, y = x0 + _F(block % _BLOCKS_X * BLOCK_SIZE), y0 + _F(block // _BLOCKS_X * BLOCK_SIZE)
-                running[block] = _blend_block(batch, members[block], x, y, nearest, state, block * _STATE)
+                running[block] = _blend_block(batch, members[block], x, y, nearest, state, block * _STATE_SIZE)
                 any_running |= running[block]
         if not any_running:
             break
@@ -216,11 +218,11 @@ def _find_members(batch, count, x0, y0, members):
         at = _U(k) * _U(SPLAT_SIZE)
         for side in range(4):
             boxes[side, k] = batch[at + _U(LEFT + side)]
-    boxes = boxes.reshape(-1)
+    flat = boxes.reshape(-1)
     columns, rows = np.zeros(_BLOCKS_X, dtype=np.uint64), np.zeros(_BLOCKS_X, dtype=np.uint64)
     for group in range(0, _BATCH_SIZE, LANES):
-        left, right = load(boxes, group), load(boxes, _BATCH_SIZE + group)
-        top, bottom = load(boxes, 2 * _BATCH_SIZE + group), load(boxes, 3 * _BATCH_SIZE + group)
+        left, right = load(flat, group), load(flat, _BATCH_SIZE + group)
+        top, bottom = load(flat, 2 * _BATCH_SIZE + group), load(flat, 3 * _BATCH_SIZE + group)
         for i in range(_BLOCKS_X):
             first, last = _F(i * BLOCK_SIZE), _F(i * BLOCK_SIZE + BLOCK_SIZE - 1)
             in_column = mask_bits((left <= x0 + last) & (right >= x0 + first))
@@ -236,7 +238,7 @@ def _find_members(batch, count, x0, y0, members):
 def _blend_block(batch, members, x0, y0, nearest, state, at):
     """Blend the splats in `batch` that have a bit in `members` into a block of pixels.
 
-    The block's first pixel is x0, y0, and its state is at `at`. Returns whether any of its rays goes on.
+    The block's first pixel is x0, y0, and its state is at `at`. Return whether any of its rays goes on.
     """
     columns, rows = load(_COLUMNS, 0) + x0, load(_ROWS, 0) + y0
     transmittance = load(state, at + _TRANSMITTANCE * LANES)
@@ -279,7 +281,7 @@ def _finish_tile(state, x0, y0, nearest, background, rgb, depth, median_depth, d
     """Write a tile's state to the images."""
     height, width = depth.shape
     for block in range(_BLOCKS):
-        at = block * _STATE
+        at = block * _STATE_SIZE
         covered = minimum(load(state, at + _COVERED * LANES), _ONE)
         store(state, at + _COVERED * LANES, covered)
         uncovered = _ONE - covered

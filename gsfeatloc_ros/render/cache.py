@@ -10,7 +10,7 @@ import logging
 import math
 import os
 import zlib
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -27,6 +27,7 @@ _log = logging.getLogger(__name__)
 # A cache is this line, the CRC-32 of all that follows the next number (4 bytes), the length of the header (4 bytes,
 # both little-endian), the header (JSON) and the arrays one after another.
 _MAGIC = b"gsfeatloc_ros prepared map\n"
+_ARRAYS = ("gaussians", "sh", "low", "high")
 _MAX_HEADER_BYTES = 64 * 1024
 # Of a map's content so many blocks are hashed, spread evenly. Size and time alone may be those of another map: images
 # of containers and archives set all times to the same. To hash it all takes reading it all, which the cache is to save.
@@ -68,7 +69,7 @@ def load_prepared(
 
 
 def _read_if_usable(path: Path, origin: dict[str, Any]) -> PreparedMap | None:
-    """The map in a cache; None where there is no cache of a map of this `origin`."""
+    """Return the map in a cache; None where there is no cache of a map of this `origin`."""
     try:
         with path.open("rb") as stream:
             return _read(stream, origin)
@@ -99,7 +100,8 @@ def _read(stream: BinaryIO, origin: dict[str, Any]) -> PreparedMap | None:
         }
         if _checksum(encoded, arrays) != checksum:
             raise _CacheError("is damaged")
-        return PreparedMap(**arrays, antialiased=header["antialiased"])
+        gaussians, sh, low, high = (arrays[name] for name in _ARRAYS)
+        return PreparedMap(gaussians, sh, low, high, antialiased=header["antialiased"])
     except (KeyError, TypeError, AttributeError, ValueError, RecursionError) as error:
         raise _CacheError("is damaged") from error
 
@@ -120,8 +122,7 @@ def _write_if_possible(path: Path, prepared: PreparedMap, origin: dict[str, Any]
 
 
 def _write(stream: BinaryIO, prepared: PreparedMap, origin: dict[str, Any]) -> None:
-    values = {field.name: getattr(prepared, field.name) for field in fields(prepared)}
-    arrays = {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
+    arrays: dict[str, np.ndarray] = {name: getattr(prepared, name) for name in _ARRAYS}
     layout = {name: (array.dtype.str, array.shape) for name, array in arrays.items()}
     encoded = json.dumps({"origin": origin, "antialiased": prepared.antialiased, "arrays": layout}).encode()
     stream.write(_MAGIC)
@@ -133,18 +134,21 @@ def _write(stream: BinaryIO, prepared: PreparedMap, origin: dict[str, Any]) -> N
 
 
 def _checksum(header: bytes, arrays: dict[str, np.ndarray]) -> int:
-    return functools.reduce(lambda checksum, part: zlib.crc32(part, checksum), arrays.values(), zlib.crc32(header))
+    checksum = zlib.crc32(header)
+    for array in arrays.values():
+        checksum = zlib.crc32(array.data, checksum)
+    return checksum
 
 
 def _origin(path: Path) -> dict[str, Any]:
-    """What a cache is made from: the code that reads and prepares maps, and the files of the map."""
+    """Return what a cache is made from: the code that reads and prepares maps, and the files of the map."""
     folder = path if path.is_dir() else path.parent if path.suffix == ".json" else None
     files = [path] if folder is None else sorted(file for file in folder.iterdir() if file.suffix in _SOG_SUFFIXES)
     return {"code": _code(), "files": [_identity(file) for file in files if file.is_file()]}
 
 
 def _identity(file: Path) -> list[Any]:
-    """Name, size in bytes, time of the last change and a hash of a sample of the content."""
+    """Return name, size in bytes, time of the last change and a hash of a sample of the content."""
     status = file.stat()
     last = max(status.st_size - _SAMPLE_BYTES, 0)
     digest = hashlib.sha256()
@@ -157,5 +161,5 @@ def _identity(file: Path) -> list[Any]:
 
 @functools.cache
 def _code() -> str:
-    """Version of the code that reads and prepares maps; all that may have a part in that counts."""
+    """Return the version of the code that reads and prepares maps; all that may have a part in that counts."""
     return hash_of_sources("maps", "render")

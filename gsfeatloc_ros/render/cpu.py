@@ -33,7 +33,7 @@ class CpuRenderer(SplatRenderer):
         threads: int = 0,
         options: DrawOptions = DEFAULT_DRAW_OPTIONS,
     ) -> None:
-        """See `create_renderer`. A GaussianMap is not kept, only what is prepared from it.
+        """Prepare a map, if it is not yet; see `create_renderer`. A GaussianMap is not kept.
 
         Raises:
             ValueError: a number of threads out of its range.

@@ -50,7 +50,7 @@ class GpuRenderer(SplatRenderer):
         options: DrawOptions = DEFAULT_DRAW_OPTIONS,
         device: str = "cuda",
     ) -> None:
-        """See `create_renderer`; `device` is torch's. The first on a device draws two small pictures to check it.
+        """Bring a map to a device of torch's; see `create_renderer`. The first on a device draws two to check it.
 
         Raises:
             RuntimeError: gsplat does not work on the device, or draws other pictures than the CPU does.

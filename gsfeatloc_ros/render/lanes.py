@@ -58,7 +58,7 @@ class _MaskModel(models.PrimitiveModel):
 
 
 def _broadcast(builder, number):
-    """A vector with the same number in every lane."""
+    """Write a vector with the same number in every lane."""
     undefined = ir.Constant(ir.VectorType(number.type, LANES), ir.Undefined)
     first = builder.insert_element(undefined, number, ir.Constant(ir.IntType(32), 0))
     return builder.shuffle_vector(first, undefined, ir.Constant(_INTS, [0] * LANES))
@@ -105,7 +105,7 @@ def _lower_and(context, builder, sig, args):
 
 @intrinsic
 def broadcast(typingctx, number):
-    """The same number in every lane."""
+    """Return a number in every lane."""
 
     def codegen(context, builder, sig, args):
         return _broadcast(builder, args[0])
@@ -113,28 +113,33 @@ def broadcast(typingctx, number):
     return _LANES(types.float32), codegen
 
 
-def _pointer(context, builder, array_type, array, index, vector):
-    data = context.make_array(array_type)(context, builder, array).data
+def _data(context, builder, array_type, array):
+    """Point to the first element of an array."""
+    return context.make_array(array_type)(context, builder, array).data
+
+
+def _vector_at(builder, data, index, vector):
+    """Point to the elements from an index on, as a vector."""
     return builder.bitcast(builder.gep(data, [index]), vector.as_pointer())
 
 
 @intrinsic
 def load(typingctx, array, index):
-    """array[index : index + LANES] of a flat, contiguous float32 array; neither end is checked."""
+    """Return array[index : index + LANES] of a flat, contiguous float32 array; neither end is checked."""
 
     def codegen(context, builder, sig, args):
-        return builder.load(_pointer(context, builder, sig.args[0], *args, _FLOATS), align=4)
+        data = _data(context, builder, sig.args[0], args[0])
+        return builder.load(_vector_at(builder, data, args[1], _FLOATS), align=4)
 
     return _LANES(array, types.intp), codegen
 
 
 @intrinsic
 def prefetch(typingctx, array, index):
-    """Have array[index] brought into the CPU's cache meanwhile."""
+    """Let array[index] be brought into the CPU's cache meanwhile."""
 
     def codegen(context, builder, sig, args):
-        data = context.make_array(sig.args[0])(context, builder, args[0]).data
-        pointer = builder.gep(data, [args[1]])
+        pointer = builder.gep(_data(context, builder, sig.args[0], args[0]), [args[1]])
         integer = ir.IntType(32)
         function_type = ir.FunctionType(ir.VoidType(), [pointer.type, integer, integer, integer])
         function = cgutils.get_or_insert_function(builder.module, function_type, "llvm.prefetch.p0")
@@ -147,13 +152,14 @@ def prefetch(typingctx, array, index):
 
 @intrinsic
 def load_halves(typingctx, array, index):
-    """The same of a float16 array of finite numbers, given as the int16 view of it that numba knows.
+    """Do as `load` with a float16 array of finite numbers, given as the int16 view of it that numba knows.
 
-    Its bits moved to where a float32 has them, and multiplied: not all CPUs have an instruction for it.
+    Move its bits to where a float32 has them, and multiply: not all CPUs have an instruction for it.
     """
 
     def codegen(context, builder, sig, args):
-        halves = builder.load(_pointer(context, builder, sig.args[0], *args, _SHORTS), align=2)
+        data = _data(context, builder, sig.args[0], args[0])
+        halves = builder.load(_vector_at(builder, data, args[1], _SHORTS), align=2)
         moved = builder.shl(builder.sext(halves, _INTS), ir.Constant(_INTS, [13] * LANES))
         bits = builder.and_(moved, ir.Constant(_INTS, [_HALF_BITS] * LANES))
         return builder.fmul(builder.bitcast(bits, _FLOATS), ir.Constant(_FLOATS, [_HALF_SCALE] * LANES), flags=_FLAGS)
@@ -163,7 +169,7 @@ def load_halves(typingctx, array, index):
 
 @intrinsic
 def offsets(typingctx, points, origin, axis):
-    """How far points lie from an origin, and how far from it along an axis: (x, y, z, along), in float64 until rounded.
+    """Return how far points lie from an origin, and how far along an axis: (x, y, z, along), in float64 until rounded.
 
     Args:
         points: tuple of three Lanes.
@@ -187,11 +193,11 @@ def offsets(typingctx, points, origin, axis):
 
 @intrinsic
 def store(typingctx, array, index, values):
-    """array[index : index + LANES] = values, of a flat, contiguous float32 array; neither end is checked."""
+    """Do array[index : index + LANES] = values with a flat, contiguous float32 array; neither end is checked."""
 
     def codegen(context, builder, sig, args):
-        pointer = _pointer(context, builder, sig.args[0], args[0], args[1], _FLOATS)
-        builder.store(args[2], pointer, align=4)
+        data = _data(context, builder, sig.args[0], args[0])
+        builder.store(args[2], _vector_at(builder, data, args[1], _FLOATS), align=4)
         return context.get_dummy_value()
 
     return types.void(array, types.intp, _LANES), codegen
@@ -213,9 +219,10 @@ def store_columns(typingctx, array, index, mask, rows):
     def codegen(context, builder, sig, args):
         array_type, _, _, _ = sig.args
         array, at, mask, rows = args
+        data = _data(context, builder, array_type, array)
         for lane, column in enumerate(_transposed(builder, [builder.extract_value(rows, i) for i in range(LANES)])):
             # Each goes to where the next one then overwrites it unless it is in the mask.
-            builder.store(column, _pointer(context, builder, array_type, array, at, _FLOATS), align=4)
+            builder.store(column, _vector_at(builder, data, at, _FLOATS), align=4)
             step = builder.zext(builder.extract_element(mask, ir.Constant(ir.IntType(32), lane)), at.type)
             at = builder.add(at, builder.mul(step, ir.Constant(at.type, LANES)))
         return at
@@ -224,7 +231,7 @@ def store_columns(typingctx, array, index, mask, rows):
 
 
 def _transposed(builder, rows: list) -> list:
-    """The columns of a square matrix: blocks off its diagonal change places, of half the size each time."""
+    """Return the columns of a square matrix: exchange the blocks off its diagonal, of half the size each time."""
     for size in (8, 4, 2, 1):
         from_a = [lane if not lane & size else LANES + lane - size for lane in range(LANES)]
         from_b = [lane + size if not lane & size else LANES + lane for lane in range(LANES)]
@@ -237,7 +244,7 @@ def _transposed(builder, rows: list) -> list:
 
 @intrinsic
 def select(typingctx, mask, a, b):
-    """`a` in the lanes of the mask, `b` in the others; either may be a number."""
+    """Return `a` in the lanes of the mask, `b` in the others; either may be a number."""
 
     def codegen(context, builder, sig, args):
         a, b = (v if t is _LANES else _broadcast(builder, v) for v, t in zip(args[1:], sig.args[1:], strict=True))
@@ -248,7 +255,7 @@ def select(typingctx, mask, a, b):
 
 @intrinsic
 def mask_bits(typingctx, mask):
-    """The mask as a number, of which bit i is lane i."""
+    """Return the mask as a number, of which bit i is lane i."""
 
     def codegen(context, builder, sig, args):
         return builder.zext(builder.bitcast(args[0], ir.IntType(LANES)), ir.IntType(32))
@@ -258,7 +265,7 @@ def mask_bits(typingctx, mask):
 
 @intrinsic
 def lowest_bit(typingctx, bits):
-    """Position of the lowest bit that is set; some is."""
+    """Return the position of the lowest bit that is set; some is."""
 
     def codegen(context, builder, sig, args):
         return builder.cttz(args[0], ir.Constant(ir.IntType(1), 1))
@@ -277,7 +284,7 @@ def bits_of_float(typingctx, value):
 
 
 def _unary(name: str):
-    """One of LLVM's functions of a float, lane by lane."""
+    """Make one of LLVM's functions of a float, lane by lane."""
 
     def typer(typingctx, values):
         def codegen(context, builder, sig, args):
@@ -295,19 +302,19 @@ sqrt, floor, log2 = _unary("llvm.sqrt"), _unary("llvm.floor"), _unary("llvm.log2
 
 @njit
 def minimum(a, b):
-    """The smaller in each lane; b where either is NaN."""
+    """Return the smaller in each lane; b where either is NaN."""
     return select(a < b, a, b)
 
 
 @njit
 def maximum(a, b):
-    """The larger in each lane; b where either is NaN."""
+    """Return the larger in each lane; b where either is NaN."""
     return select(a > b, a, b)
 
 
 @intrinsic
 def _times_power_of_two(typingctx, values, exponents):
-    """values 2^exponents, of values in [1, 2) and whole exponents in [-126, 127]."""
+    """Return values 2^exponents, for values in [1, 2) and whole exponents in [-126, 127]."""
 
     def codegen(context, builder, sig, args):
         shift = builder.shl(builder.fptosi(args[1], _INTS), ir.Constant(_INTS, [23] * LANES))
@@ -323,7 +330,7 @@ _P3, _P4 = np.float32(5.20114611e-2), np.float32(1.3534168e-2)
 
 @njit
 def exp2(x):
-    """2^x to a relative 3e-6, for x from -126 to below 128; anything for others."""
+    """Return 2^x to a relative 3e-6, for x from -126 to below 128; anything for others."""
     whole = floor(x)
     f = x - whole
     return _times_power_of_two(_P0 + f * (_P1 + f * (_P2 + f * (_P3 + f * _P4))), whole)

@@ -1,5 +1,7 @@
 """What is made of a map once, when it is loaded: Gaussians in the order and form that the CPU renderer needs."""
 
+# Kernels take as many parameters as they need: render/kernels.py says why.
+
 from __future__ import annotations
 
 import math

@@ -1,5 +1,7 @@
 """Kernel 1 of a frame: project the Gaussians, colour them, and list the tiles that each touches."""
 
+# Kernels take as many parameters as they need: render/kernels.py says why.
+
 from __future__ import annotations
 
 import math
@@ -189,7 +191,7 @@ def _ceil(x):
 
 @njit
 def _colors(sh, at, harmonics, x, y, z):
-    """Red, green and blue of spherical harmonics in the unit directions x, y, z."""
+    """Return red, green and blue of spherical harmonics in the unit directions x, y, z."""
     half = broadcast(_F(0.5))
     color = _add_harmonic(sh, at, 0, broadcast(_SH0), (half, half, half))
     if harmonics > 1:
@@ -252,7 +254,7 @@ def _list_tiles(splats, first, last, tiles_x, tiles, keys, pairs, histogram):
 
 @njit(error_model="numpy")
 def _ellipse_in_rows(splats, at, first, last):
-    """Leftmost and rightmost x of a splat's ellipse within the rows of pixels `first` to `last`, which it meets."""
+    """Return the leftmost and rightmost x of a splat's ellipse within the rows `first` to `last`, which it meets."""
     # a (dx - slant dy)^2 + b dy^2 <= level
     slant, a, b = splats[at + SLANT], -splats[at + CONIC_X], -splats[at + CONIC_Y]
     level = splats[at + LOG_OPACITY] - _LOG_MIN_ALPHA

@@ -13,7 +13,14 @@ from pictures import photo_of, smooth_noise
 from stand_in.gpu import simulated_gpu
 
 from gsfeatloc_ros.common.local_structure import local_structure
-from gsfeatloc_ros.match.track import DISTANCE, GAIN, MAX_CORNERS, MIN_CONTRAST, NEIGHBOURHOOD, CornerTracker
+from gsfeatloc_ros.match.track import (
+    MAX_CORNERS,
+    MIN_CORNER_DISTANCE,
+    STRUCTURE_GAIN,
+    STRUCTURE_MIN_CONTRAST,
+    STRUCTURE_SIGMA,
+    CornerTracker,
+)
 from gsfeatloc_ros.match.track_gpu import GpuCornerTracker
 
 WIDTH, HEIGHT = 160, 120
@@ -72,7 +79,7 @@ def test_corners_keep_their_distance_also_in_noise_and_are_not_too_many() -> Non
     assert corners.dtype == np.float32
     assert len(corners) == MAX_CORNERS
     distances = np.linalg.norm(corners[:, None] - corners, axis=2) + 1e3 * np.eye(len(corners))
-    assert distances.min() >= DISTANCE
+    assert distances.min() >= MIN_CORNER_DISTANCE
 
 
 def test_corners_of_a_chessboard_which_are_all_equal_are_found_once() -> None:
@@ -96,7 +103,7 @@ def test_the_border_of_what_the_lens_saw_is_no_corner() -> None:
 
 def test_the_pyramid_is_of_local_structure_and_opencvs_halvings() -> None:
     photo = photo_of(smooth_noise(2, 151, 233))
-    structure = GAIN * local_structure(photo.gray(), NEIGHBOURHOOD, MIN_CONTRAST)[0]
+    structure = STRUCTURE_GAIN * local_structure(photo.gray(), STRUCTURE_SIGMA, STRUCTURE_MIN_CONTRAST)[0]
     expected = np.clip(structure, -128, 128)
     for level in GpuCornerTracker(photo, "cpu")._pyramid:
         # Where brightness is half-way between two whole numbers OpenCV may take the other.

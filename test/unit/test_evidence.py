@@ -103,6 +103,12 @@ def test_a_blurred_photo_is_given_more_room_up_to_twice_the_error() -> None:
     assert inlier_ratio(np.array([4.0, 4.0, 5.9, 6.1]), 3.0) == 0.75
 
 
+@given(st.lists(st.floats(0, 100), min_size=1, max_size=50))
+def test_inliers_are_within_once_and_twice_the_error(errors: list[float]) -> None:
+    ratio = inlier_ratio(np.array(errors), 3.0)
+    assert np.mean(np.array(errors) <= 3.0) <= ratio <= np.mean(np.array(errors) <= 6.0)
+
+
 def test_deviation_counts_standard_deviations_of_the_prior() -> None:
     default = np.diag([0.25] * 3 + [0.04] * 3)
     moved = make_pose(so3_exp(np.array([0.0, 0.4, 0.0])), np.array([0.5, 0.0, 0.0]))

@@ -15,7 +15,6 @@ from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.geometry import invert, make_pose, so3_exp, transform
 from gsfeatloc_ros.common.local_structure import local_structure
 from gsfeatloc_ros.common.photo import Photo
-from gsfeatloc_ros.localize.evidence import agreeing_share
 from gsfeatloc_ros.match.track import CornerTracker
 from gsfeatloc_ros.match.track_gpu import GpuCornerTracker
 from gsfeatloc_ros.render import create_renderer
@@ -81,8 +80,10 @@ def test_blank_pictures_have_no_corners(tracker_of, value: int) -> None:
     tracker = tracker_of(photo_of(blank))
     assert len(tracker.corners) == 0
     assert len(tracker.track(smooth_noise(0))) == 0
-    found = tracker_of(photo_of(smooth_noise(0))).track(blank)
-    assert np.isfinite(found.b).all()
+    textured = tracker_of(photo_of(smooth_noise(0)))
+    assert len(textured.corners) > 50
+    # In what is blank nothing can be found again.
+    assert len(textured.track(blank)) == 0
 
 
 @both_trackers
@@ -114,16 +115,3 @@ def test_structure_does_not_know_brightness_and_contrast(gain: float, offset: fl
     changed = np.rint(gain * gray + offset).astype(np.uint8)
     a, b = (local_structure(image, 6.0, 2.0)[0] for image in (gray, changed))
     assert np.corrcoef(a.ravel(), b.ravel())[0, 1] > 0.99
-
-
-@given(st.lists(st.floats(0, 100), min_size=1, max_size=50))
-def test_share_that_agrees(errors: list[float]) -> None:
-    errors = np.array(errors)
-    share = agreeing_share(errors, 3.0)
-    assert np.mean(errors <= 3.0) <= share <= np.mean(errors <= 6.0)
-
-
-def test_blur_widens_what_agrees_but_nonsense_does_not() -> None:
-    assert agreeing_share(np.array([0.2] * 9 + [3.5]), 3.0) == 0.9
-    assert agreeing_share(np.array([1.2] * 9 + [3.5]), 3.0) == 1.0
-    assert agreeing_share(np.array([20.0] * 9 + [3.5]), 3.0) == 0.1
