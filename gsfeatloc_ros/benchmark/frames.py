@@ -15,21 +15,23 @@ from gsfeatloc_ros.common.geometry import make_pose
 from gsfeatloc_ros.common.stage_clock import StageClock
 from gsfeatloc_ros.evaluate.scene import load_scene
 from gsfeatloc_ros.localize.first_run import warm_up
+from gsfeatloc_ros.localize.settings import RendererSettings
 from gsfeatloc_ros.maps import GaussianMap, load_map
 from gsfeatloc_ros.render import DrawOptions, Render, SplatRenderer, create_renderer
 from gsfeatloc_ros.render.cache import load_prepared
+from gsfeatloc_ros.render.prepare import PreparedMap
 
 Size = tuple[int, int]
 
 _FIELD_OF_VIEW = 65.0  # degrees, horizontal
-# A view of a whole map has this share of the Gaussians on each side of what it looks at.
-_OUTSIDE = 0.05
+# A view of a whole map leaves this fraction of the Gaussians out on each side.
+_OUTSIDE_FRACTION = 0.05
 # The first frames grow the renderer's buffers.
-UNCOUNTED = 2
+UNCOUNTED_FRAMES = 2
 
 
 def measure_map(
-    path: Path, size: Size, pose: np.ndarray | None, frames: int, device: str, threads: int
+    path: Path, size: Size, pose: np.ndarray | None, frames: int, settings: RendererSettings
 ) -> dict[str, Any]:
     """Load a map, draw the same frame again and again, and load it once more from a cache.
 
@@ -38,13 +40,13 @@ def measure_map(
         size: width and height of the frame, pixels.
         pose: (4, 4) T_map_camera; None for one from which the whole map is in view.
         frames: how many are measured.
-        device, threads: as in create_renderer.
+        settings: of the renderer.
 
     Raises:
         ValueError, OSError: the map or the device cannot be used.
     """
-    warm_up(device=device, threads=threads)
-    renderer, cold = _measure_load(lambda: create_renderer(load_map(path), device, threads))
+    warm_up(device=settings.device, threads=settings.threads)
+    renderer, cold = _measure_load(lambda: _create_renderer(load_map(path), settings))
     gaussian_map = load_map(path)
     if pose is None:
         pose = view_of_all(gaussian_map)
@@ -60,8 +62,17 @@ def measure_map(
     with tempfile.TemporaryDirectory() as folder:
         cache_path = Path(folder) / "cache"
         load_prepared(path, cache_path=cache_path)
-        cached = _measure_load(lambda: create_renderer(load_prepared(path, cache_path=cache_path), device, threads))[1]
+        cached = _measure_load(lambda: _create_renderer(load_prepared(path, cache_path=cache_path), settings))[1]
     return report | {"load": {"cold": cold, "from_cache": cached}}
+
+
+def _create_renderer(
+    gaussian_map: GaussianMap | PreparedMap,
+    settings: RendererSettings,
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> SplatRenderer:
+    options = DrawOptions(background, settings.sh_degree, settings.resolution_scale)
+    return create_renderer(gaussian_map, settings.device, settings.threads, options)
 
 
 def _measure_load(load: Callable[[], SplatRenderer]) -> tuple[SplatRenderer, dict[str, float]]:
@@ -77,7 +88,7 @@ def _measure_load(load: Callable[[], SplatRenderer]) -> tuple[SplatRenderer, dic
     return loaded.result, figures
 
 
-def measure_scene(path: Path, size: Size, device: str, threads: int) -> dict[str, Any]:
+def measure_scene(path: Path, size: Size, settings: RendererSettings) -> dict[str, Any]:
     """Draw a frame at the pose of each test photo of a scene, with the first one's camera at `size`.
 
     Raises:
@@ -85,21 +96,21 @@ def measure_scene(path: Path, size: Size, device: str, threads: int) -> dict[str
     """
     scene = load_scene(path)
     gaussian_map = load_map(scene.map_path)
-    renderer = create_renderer(gaussian_map, device, threads, DrawOptions(scene.background))
+    renderer = _create_renderer(gaussian_map, settings, scene.background)
     poses = [photo.T_map_camera for photo in scene.photos]
     report = {"map": scene.name, "gaussians": len(gaussian_map), "sh_degree": gaussian_map.sh_degree}
     return report | measure_frames(renderer, scene.camera.scaled(*size), poses)
 
 
 def measure_frames(renderer: SplatRenderer, camera: Camera, poses: list[np.ndarray]) -> dict[str, Any]:
-    """Milliseconds of frames at `poses`, (4, 4) each, also by stage (mean), and how much of the last one is covered."""
+    """Measure frames at `poses`, (4, 4) each: milliseconds, those by stage (mean), coverage of the last one."""
 
     def draw(pose: np.ndarray) -> Render:
         render = renderer.render(camera, pose)
         finish(renderer.device)
         return render
 
-    for pose in poses[:UNCOUNTED]:
+    for pose in poses[:UNCOUNTED_FRAMES]:
         draw(pose)
     frames = [timed(draw, pose) for pose in poses]
     # Apart from the others, whose time this is not to cost.
@@ -137,15 +148,15 @@ def print_frames(report: dict[str, Any]) -> None:
 
 
 def pinhole(size: Size) -> Camera:
-    """A camera of width and height `size` with a usual field of view."""
+    """Return a camera of width and height `size` with a usual field of view."""
     width, height = size
     focal = 0.5 * width / np.tan(np.radians(0.5 * _FIELD_OF_VIEW))
     return Camera(width, height, np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1.0]]))
 
 
 def view_of_all(gaussian_map: GaussianMap) -> np.ndarray:
-    """Pose (4, 4) T_map_camera, along the z axis of the file, with nearly all of the map in view."""
-    low, high = np.quantile(gaussian_map.means, [_OUTSIDE, 1 - _OUTSIDE], axis=0)
+    """Return a pose (4, 4) T_map_camera, along the z axis of the file, with nearly all of the map in view."""
+    low, high = np.quantile(gaussian_map.means, [_OUTSIDE_FRACTION, 1 - _OUTSIDE_FRACTION], axis=0)
     distance = np.max(high - low) / np.tan(np.radians(0.5 * _FIELD_OF_VIEW))
     position = 0.5 * (low + high) - [0, 0, distance]
     return gaussian_map.S_map_splat.transform_pose(make_pose(np.eye(3), position))

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch.utils.cpp_extension import load_inline
 
-from gsfeatloc_ros.benchmark.frames import UNCOUNTED
+from gsfeatloc_ros.benchmark.frames import UNCOUNTED_FRAMES
 from gsfeatloc_ros.benchmark.measure import spread, timed
 from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.geometry import invert
@@ -66,7 +66,7 @@ def measure_against_opensplat(
     theirs = _opensplat(checkout, gaussian_map, camera)
     renderer = create_renderer(gaussian_map, "cpu", threads)
     draw = {"ours": lambda pose: renderer.render(camera, pose).rgb, "opensplat": theirs}
-    for pose in poses[:UNCOUNTED]:
+    for pose in poses[:UNCOUNTED_FRAMES]:
         for function in draw.values():
             function(pose)
     frames = {name: [] for name in draw}

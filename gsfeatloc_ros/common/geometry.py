@@ -6,12 +6,13 @@ A pose ``T_a_b`` is a 4x4 float64 matrix that maps points of frame b into frame 
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 # Below this angle (radians) the closed forms divide nearly 0 by nearly 0: use their series.
 _SMALL_ANGLE = 1e-6
 
 
-def make_pose(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
+def make_pose(rotation: ArrayLike, translation: ArrayLike) -> np.ndarray:
     """Build a pose (4, 4) from a rotation matrix (3, 3) and a translation (3,)."""
     pose = np.eye(4)
     pose[:3, :3] = rotation
@@ -55,7 +56,7 @@ def so3_log(rotation: np.ndarray) -> np.ndarray:
     return scale * np.array([x, y, z])
 
 
-def matrix_from_quaternion(quaternion: np.ndarray) -> np.ndarray:
+def matrix_from_quaternion(quaternion: ArrayLike) -> np.ndarray:
     """Return the rotation matrix (3, 3) of a quaternion (4,) xyzw of any positive norm.
 
     Raises:

@@ -28,6 +28,7 @@ from gsfeatloc_ros.benchmark.query import measure_queries, print_queries
 from gsfeatloc_ros.benchmark.scaling import COUNTS, draw_scaling, measure_scaling
 from gsfeatloc_ros.common.geometry import make_pose, matrix_from_quaternion, quaternion_from_matrix
 from gsfeatloc_ros.evaluate.scene import load_scene
+from gsfeatloc_ros.localize.settings import RendererSettings
 from gsfeatloc_ros.maps import load_map
 from gsfeatloc_ros.maps.ply import write_ply
 from gsfeatloc_ros.match import DEFAULT_MATCHER, MATCHERS
@@ -116,11 +117,12 @@ def _parser() -> argparse.ArgumentParser:
 
 def _render(options: argparse.Namespace) -> None:
     _check_frames(options)
+    settings = RendererSettings(device=options.device, threads=options.threads)
     if options.scene:
-        report = measure_scene(options.scene, options.size, options.device, options.threads)
+        report = measure_scene(options.scene, options.size, settings)
     else:
         pose = _pose(options.pose) if options.pose else None
-        report = measure_map(options.map, options.size, pose, options.frames, options.device, options.threads)
+        report = measure_map(options.map, options.size, pose, options.frames, settings)
     print_frames(report)
     _write(options.json, report | {"device": options.device, "threads": options.threads})
 
