@@ -113,16 +113,19 @@ def test_a_photo_of_nothing_is_a_failure_with_a_reason(localizer, room_camera, r
     assert "0 features" in estimate.reason
 
 
+@pytest.mark.slow
 def test_a_prior_that_sees_nothing_is_a_failure(localizer, room_camera, room_photos) -> None:
     outside = make_pose(np.eye(3), np.array([0, 0, 1000.0]))
     assert_no_answer(localizer.localize(room_photos[0].image, room_camera, outside))
 
 
+@pytest.mark.slow
 def test_noise_is_no_place(localizer, room_camera, room_photos) -> None:
     noise = np.random.default_rng(0).integers(0, 256, room_photos[0].image.shape, dtype=np.uint8)
     assert_no_answer(localizer.localize(noise, room_camera, room_photos[0].T_map_camera))
 
 
+@pytest.mark.slow
 def test_mirrored_photos_are_rejected(localizer, room_camera, room_photos) -> None:
     """Seen from behind, through the wall, the room is mirrored: poses there match well, but are far from the prior."""
     for photo in room_photos[:2]:
@@ -159,6 +162,7 @@ def test_the_estimate_is_verified_by_the_render_there(renderer, room_camera, roo
         assert estimate.evidence.passes >= 1
 
 
+@pytest.mark.slow
 def test_distortion_is_taken_out(sift_localizer, room_camera, room_photos) -> None:
     """Without the distortion coefficients the same photo gives a clearly worse pose, or none."""
     photo = room_photos[0]

@@ -140,6 +140,7 @@ def test_the_robots_own_frame_changes_nothing():
         np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1])
 def test_answers_are_in_the_robots_frame(room_map, room_camera, room_photos, seed):
     S_map_splat = random_similarity(seed)

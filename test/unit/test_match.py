@@ -26,6 +26,15 @@ TOLERANCES = {
 }
 
 
+# The others are tested too, but not by `make unit`.
+QUICK = ("sift", "xfeat")
+
+
+def each(names: Iterable[str]) -> list:
+    """Return parameters that are slow but for QUICK ones."""
+    return [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in names]
+
+
 @pytest.fixture(scope="module")
 def create(tmp_path_factory):
     """Makes matchers by name, with random weights where there are no others."""
@@ -34,12 +43,12 @@ def create(tmp_path_factory):
     return lambda name, **options: create_matcher(name, weights=weights.get(name, ""), **options)
 
 
-@pytest.fixture(scope="module", params=MATCHERS)
+@pytest.fixture(scope="module", params=each(MATCHERS))
 def matcher(request, create):
     return create(request.param)
 
 
-@pytest.fixture(scope="module", params=TOLERANCES)
+@pytest.fixture(scope="module", params=each(TOLERANCES))
 def trained(request):
     return request.param, create_matcher(request.param)
 
@@ -106,7 +115,7 @@ def test_tiny_images_do_no_harm(matcher, size) -> None:
     assert len(matcher.match(features, features)) <= len(features)
 
 
-@pytest.mark.parametrize("name", MATCHERS)
+@pytest.mark.parametrize("name", each(MATCHERS))
 def test_max_features_is_kept(create, name) -> None:
     matcher = create(name, max_features=50)
     features = matcher.features(rectangles(240, 320))
@@ -115,7 +124,7 @@ def test_max_features_is_kept(create, name) -> None:
         assert 0 < len(features) <= 51
 
 
-@pytest.mark.parametrize("name", ["superpoint-superglue", "superpoint-lightglue"])
+@pytest.mark.parametrize("name", each(["superpoint-superglue", "superpoint-lightglue"]))
 def test_superpoint_matches_are_those_of_the_whole_model(create, monkeypatch, name) -> None:
     """The model's own forward(), which takes both images at once and leaves keypoints on whole pixels, is the judge."""
     monkeypatch.setattr("gsfeatloc_ros.match.superpoint.centroid", lambda peaks, heatmap: peaks.float())

@@ -128,6 +128,7 @@ def test_superglue_s_folder_is_not_lightglue_s(tmp_path) -> None:
         create_matcher("superpoint-lightglue", weights=str(tmp_path))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in MATCHERS if MATCHERS[name].experimental])
 def test_an_experimental_matcher_warns_once_and_says_its_licence(tmp_path, caplog, name) -> None:
     weights = WRITERS[name](tmp_path)

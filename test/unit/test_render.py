@@ -135,6 +135,7 @@ def needles(seed: int, count: int) -> GaussianMap:
     return replace(gaussian_map, means=means.astype(np.float32), scales=scales.astype(np.float32))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(5))
 def test_needles_are_nearly_drawn_as_the_reference_draws_them(seed: int) -> None:
     gaussian_map, camera = needles(seed, 100), Camera(320, 240, np.array([[250.0, 0, 160], [0, 250, 120], [0, 0, 1]]))
@@ -183,6 +184,7 @@ def test_splats_are_drawn_in_order_however_close_they_are() -> None:
     np.testing.assert_array_equal((drawn[:, 0] > drawn[:, 1])[told_apart], (red_depth < green_depth)[told_apart])
 
 
+@pytest.mark.slow
 def test_crowded_tiles_make_the_buffers_grow() -> None:
     """Every Gaussian covers every tile: far more pairs than the buffers start with."""
     rng = np.random.default_rng(0)

@@ -123,6 +123,7 @@ def test_nearest_solid_hides_the_others(room):
     np.testing.assert_allclose([ball.item(), table.item(), floor.item()], [2.0 - 1.03 - 0.23, 1.2, 2.0], atol=1e-5)
 
 
+@pytest.mark.slow
 def test_rooms_of_a_seed_are_the_same_and_of_another_are_not(room):
     again, other = Room(seed=0), Room(seed=1)
     np.testing.assert_array_equal(again.pictures[0][0], room.pictures[0][0])

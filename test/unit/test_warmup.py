@@ -140,6 +140,7 @@ print(len(compilations.buffer))
 """
 
 
+@pytest.mark.slow
 def test_kernels_of_an_unwritable_install_are_compiled_once(unwritable_install, tmp_path, room_map_file):
     where = {"XDG_CACHE_HOME": str(tmp_path)}
     first, second = (run(unwritable_install, "-m", "gsfeatloc_ros.tools.warmup", **where) for _ in range(2))
@@ -151,6 +152,7 @@ def test_kernels_of_an_unwritable_install_are_compiled_once(unwritable_install, 
     assert run(unwritable_install, "-c", USE, str(room_map_file), **where).strip() == "0"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["sift", "xfeat"])
 def test_warm_up_goes_all_the_way_through_a_localization(name):
     done = warm_up(create_matcher(name), "cpu")
