@@ -15,7 +15,6 @@ from room_datasets import write_nerfstudio
 from gsfeatloc_ros.benchmark.frames import pinhole, view_of_all
 from gsfeatloc_ros.benchmark.measure import memory_taken, spread, timed
 from gsfeatloc_ros.benchmark.opensplat import measure_against_opensplat
-from gsfeatloc_ros.benchmark.query import measure_queries
 from gsfeatloc_ros.benchmark.scaling import draw_scaling, measure_scaling
 from gsfeatloc_ros.common.geometry import invert, quaternion_from_matrix, transform
 from gsfeatloc_ros.maps import load_map
@@ -85,6 +84,7 @@ def test_two_rooms_have_as_many_gaussians_as_asked(count):
     assert len(two_rooms(count)) == count
 
 
+@pytest.mark.slow
 def test_two_rooms_are_like_what_speed_was_promised_for():
     """A typical view sees about a fifth of the map, the other most of it, and no pixel looks through the walls."""
     gaussian_map = two_rooms(200_000)
@@ -120,6 +120,7 @@ def test_without_a_pose_the_whole_map_is_in_view(map_file, tmp_path):
     assert measured(tmp_path, "render", "--map", map_file, "--size", "64x48", "--frames", "1")["coverage"] > 0.1
 
 
+@pytest.mark.slow
 def test_frames_of_a_scene(scene, tmp_path, capsys):
     report = measured(tmp_path, "render", "--scene", scene, "--size", "160x120", "--threads", "1")
     assert (report["map"], report["frames"], report["threads"]) == (scene.name, 2, 1)
@@ -127,24 +128,18 @@ def test_frames_of_a_scene(scene, tmp_path, capsys):
     assert f"{scene.name}: {report['gaussians']} Gaussians" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_query_is_split_into_stages(scene, tmp_path, capsys):
     report = measured(tmp_path, "query", "--scene", scene, "--matcher", "sift", "--sigma", "0.3")
     assert (report["photos"], report["localized"], report["matcher"]) == (2, 2, "sift")
     stages = report["stages_cpu_ms"]
-    assert {"prepare", "features", "render", "match", "track", "solve", "judge"} <= stages.keys()
+    assert {"prepare", "features", "render", "match", "track", "solve", "verify"} <= stages.keys()
     # Medians of the parts need not add up to that of the whole.
     assert sum(stages.values()) == pytest.approx(report["cpu_ms"]["median"], rel=0.3)
     assert "2 of 2 photos localized" in capsys.readouterr().out
 
 
-def test_localizers_count_wall_time_again_after_a_measurement(scene):
-    from gsfeatloc_ros.common import stage_clock as timing
-    from gsfeatloc_ros.localize import localizer as localize
-
-    measure_queries(scene, "sift", 0.3, "cpu", 0)
-    assert localize.StageClock is timing.StageClock
-
-
+@pytest.mark.slow
 def test_scaling_measures_every_value_and_draws_it(tmp_path):
     rows = measure_scaling([1000, 2000])
     values = {varied: {row["value"] for row in rows if row["varied"] == varied} for varied in ("gaussians", "pixels")}
@@ -169,7 +164,7 @@ def test_scaling_measures_every_value_and_draws_it(tmp_path):
         (["opensplat", "--map", "MAP", "--checkout", "/nowhere", "--frames", "0"], "--frames"),
         (["synthetic", "--gaussians", "0", "--out", "MAP"], "--gaussians"),
         (["synthetic", "--gaussians", "1", "--out", "/nowhere/map.ply"], "/nowhere/map.ply"),
-        (["scaling", "--most", "0", "--out", "plot.png"], "--most"),
+        (["scaling", "--max-gaussians", "0", "--out", "plot.png"], "--max-gaussians"),
     ],
 )
 def test_what_cannot_be_measured_is_said_in_one_line(map_file, capsys, arguments, says):
@@ -177,6 +172,13 @@ def test_what_cannot_be_measured_is_said_in_one_line(map_file, capsys, arguments
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 1
     assert says in lines[0]
+
+
+def test_the_old_name_of_an_option_works_with_a_notice(capsys):
+    assert benchmark.main(["scaling", "--most", "0", "--out", "plot.png"]) == 1
+    notice, error = capsys.readouterr().err.splitlines()
+    assert notice == "--most is now --max-gaussians; the old name works until the next release"
+    assert "--max-gaussians must be at least" in error
 
 
 def test_opensplat_is_not_asked_for_what_it_cannot_draw(map_file):
