@@ -1,11 +1,15 @@
 # Every target does its own set-up (scripts/setup.sh).
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
-.PHONY: help demo test gsplat lint build setup clean
+.PHONY: help demo test unit node real gpu gsplat lint build setup clean
 
 help:
 	@echo "make demo   localize a camera in a made-up room, from start to end"
-	@echo "make test   lint, build, run the tests"
+	@echo "make test   lint, build, run all tests"
+	@echo "make unit   the quick tests that need no ROS and no data: under a minute"
+	@echo "make node   test the installed node over real DDS"
+	@echo "make real   test with real maps and scenes, where they are (test/real/README.md)"
+	@echo "make gpu    test the code for GPUs; without a GPU, on a simulated one"
 	@echo "make gsplat test the GPU renderer with gsplat's own kernels, compiled for the CPU"
 	@echo "make lint   check the style of the code"
 	@echo "make build  build with colcon, into install/"
@@ -17,6 +21,16 @@ demo: build
 # -P: what is tested is what is installed, not the sources here.
 test: lint build
 	@. scripts/env.sh && python -P -m pytest
+
+# These run the sources here. Name a test or an option of pytest by ARGS: make unit ARGS="-k camera -x"
+unit: setup
+	@. scripts/env.sh && python -m pytest test/unit -m "not slow" $(ARGS)
+
+real gpu: setup
+	@. scripts/env.sh && python -m pytest test/$@ $(ARGS)
+
+node: build
+	@. scripts/env.sh && python -P -m pytest test/node $(ARGS)
 
 # Apart from .venv, where the renderer would find it and look for a GPU in every test.
 gsplat: build
