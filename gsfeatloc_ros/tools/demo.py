@@ -28,6 +28,7 @@ from gsfeatloc_ros.match import DEFAULT_MATCHER, MATCHERS
 from gsfeatloc_ros.render import create_renderer
 from gsfeatloc_ros.simulate import Room, SimulatedPhoto, cover, simulate_photos, write_bag
 from gsfeatloc_ros.simulate.bag import CAMERA_INFO_TOPIC, IMAGE_TOPIC, PRIOR_TOPIC
+from gsfeatloc_ros.tools.options import add_old_name
 
 MIN_SUCCESS_RATE = 0.95
 # The localizer's own names of the topics are remapped to those of the bag.
@@ -73,7 +74,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("demo_output"), help="folder of the results (%(default)s)")
-    parser.add_argument("--photos", type=int, default=40, help="number of photos (%(default)s)")
+    photos = parser.add_argument("--photos", type=int, default=40, help="number of photos (%(default)s)")
+    add_old_name(parser, photos, "--queries")
     parser.add_argument(
         "--matcher", choices=sorted(MATCHERS), default=DEFAULT_MATCHER, help="of features (%(default)s)"
     )

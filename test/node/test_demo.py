@@ -13,7 +13,7 @@ from gsfeatloc_ros.client.bag_player import Reply, play_bag
 from gsfeatloc_ros.client.process import running_localizer
 from gsfeatloc_ros.client.score import score
 from gsfeatloc_ros.simulate import write_bag
-from gsfeatloc_ros.tools.demo import TOPICS, row, summary
+from gsfeatloc_ros.tools.demo import TOPICS, main, row, summary
 
 
 def test_demo_localizes_photos_of_a_bag(tmp_path):
@@ -45,6 +45,14 @@ def test_failures_and_wrong_answers_are_not_successes(room_photos):
         "localized 3 of 4 (75 %) within 1 degree and 2 cm; median error 0.00 degrees, 0.0 cm; median 250 ms"
     )
     assert summary([silent]) == "localized 0 of 1 (0 %) within 1 degree and 2 cm; no answers"
+
+
+def test_the_old_name_of_an_option_works_with_a_notice(capsys):
+    with pytest.raises(SystemExit, match="2"):
+        main(["--queries", "0"])
+    said = capsys.readouterr().err
+    assert "--queries is now --photos" in said
+    assert "--photos must be at least 1" in said
 
 
 @pytest.fixture
