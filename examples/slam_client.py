@@ -6,7 +6,7 @@ its own image, calibration and prior, as a stack in C++ would: asynchronously, w
 covariance where there is no answer, and with a look at status and covariance before it believes one.
 
     ros2 run gsfeatloc_ros localizer --ros-args -p map.path:=room.ply      # the map of the simulated room
-    python test/slam_client.py --json slam.json
+    python examples/slam_client.py --json slam.json
 """
 
 from __future__ import annotations
