@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from multiprocessing.process import BaseProcess
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import rclpy
@@ -143,9 +144,10 @@ class Observer(ClientNode):
             self._poses, self._drift = true_poses(), Drift(1)
             self._localize_client = self.node.create_client(LocalizeImage, "localizer/localize_image")
             self._calls.append(self._localize_image)
-        self._due, self._future, self._called = 0.0, None, 0
+        self._due, self._called = 0.0, 0
+        self._future: rclpy.Future | None = None
 
-    def watch(self, pid: int, robot: multiprocessing.Process) -> None:
+    def watch(self, pid: int, robot: BaseProcess) -> None:
         """Take all in until the robot has ended and the last request is answered; `pid` is the localizer's."""
         self.spin_until(lambda: bool(self.record.sent) or not robot.is_alive(), float("inf"))
         start, next_sample = time.monotonic(), 0.0
@@ -180,7 +182,7 @@ class Observer(ClientNode):
         self._send("localize_image", self._localize_client, request, take)
 
     def _send(
-        self, name: str, client: rclpy.client.Client, request: object, take: Callable[[object], tuple[float, bool]]
+        self, name: str, client: rclpy.client.Client, request: Any, take: Callable[[Any], tuple[float, bool]]
     ) -> None:
         """Send a request; `take` returns the work and the success of its answer."""
         sent = time.monotonic()

@@ -2,7 +2,7 @@
 
 from gsfeatloc_ros.simulate.bag import write_bag
 from gsfeatloc_ros.simulate.photos import SimulatedPhoto, simulate_photos
-from gsfeatloc_ros.simulate.room import Room, Trace
-from gsfeatloc_ros.simulate.splat import cover
+from gsfeatloc_ros.simulate.room import RayTrace, Room
+from gsfeatloc_ros.simulate.room_map import cover
 
-__all__ = ["Room", "SimulatedPhoto", "Trace", "cover", "simulate_photos", "write_bag"]
+__all__ = ["RayTrace", "Room", "SimulatedPhoto", "cover", "simulate_photos", "write_bag"]

@@ -20,26 +20,31 @@ _TEXEL = 0.005
 # Direction to the lamp that shades the solids, from the map frame.
 _LIGHT = np.array([0.4, -0.5, 0.77])
 
-_SHELL = Box((0.0, 0.0, 1.5), (6.0, 5.0, 3.0))
+
+def _xyz(x: float, y: float, z: float) -> np.ndarray:
+    return np.array([x, y, z])
+
+
+_SHELL = Box(_xyz(0.0, 0.0, 1.5), _xyz(6.0, 5.0, 3.0))
 _FURNITURE = (
-    Box((0.1, 0.05, 0.4), (1.2, 0.7, 0.8), yaw=0.35),  # a table, and a crate and a ball on it
-    Box((0.4, 0.15, 0.95), (0.35, 0.3, 0.3), yaw=0.9),
-    Sphere((-0.25, 0.0, 1.03), 0.23),
-    Box((-2.7, 0.9, 1.0), (0.5, 1.6, 2.0)),  # a shelf
-    Box((2.45, -1.6, 0.5), (0.8, 1.2, 1.0), yaw=-0.2),  # a cabinet and a ball on it
-    Sphere((2.45, -1.5, 1.3), 0.3),
-    Box((2.4, 1.9, 0.9), (0.6, 0.6, 1.8), yaw=0.5),  # a pillar
-    Box((-2.0, -1.9, 0.3), (0.7, 0.6, 0.6), yaw=0.6),  # two crates
-    Box((-2.0, -1.9, 0.8), (0.4, 0.45, 0.4), yaw=0.2),
-    Sphere((0.6, 2.0, 0.4), 0.4),
-    Sphere((-1.0, -2.1, 0.3), 0.3),
-    Sphere((0.3, -0.5, 2.55), 0.2),  # a lamp
-    Box((0.9, -2.43, 1.7), (1.4, 0.14, 0.9)),  # a picture
+    Box(_xyz(0.1, 0.05, 0.4), _xyz(1.2, 0.7, 0.8), yaw=0.35),  # a table, and a crate and a ball on it
+    Box(_xyz(0.4, 0.15, 0.95), _xyz(0.35, 0.3, 0.3), yaw=0.9),
+    Sphere(_xyz(-0.25, 0.0, 1.03), 0.23),
+    Box(_xyz(-2.7, 0.9, 1.0), _xyz(0.5, 1.6, 2.0)),  # a shelf
+    Box(_xyz(2.45, -1.6, 0.5), _xyz(0.8, 1.2, 1.0), yaw=-0.2),  # a cabinet and a ball on it
+    Sphere(_xyz(2.45, -1.5, 1.3), 0.3),
+    Box(_xyz(2.4, 1.9, 0.9), _xyz(0.6, 0.6, 1.8), yaw=0.5),  # a pillar
+    Box(_xyz(-2.0, -1.9, 0.3), _xyz(0.7, 0.6, 0.6), yaw=0.6),  # two crates
+    Box(_xyz(-2.0, -1.9, 0.8), _xyz(0.4, 0.45, 0.4), yaw=0.2),
+    Sphere(_xyz(0.6, 2.0, 0.4), 0.4),
+    Sphere(_xyz(-1.0, -2.1, 0.3), 0.3),
+    Sphere(_xyz(0.3, -0.5, 2.55), 0.2),  # a lamp
+    Box(_xyz(0.9, -2.43, 1.7), _xyz(1.4, 0.14, 0.9)),  # a picture
 )
 
 
 @dataclass(frozen=True, eq=False)
-class Trace:
+class RayTrace:
     """What a camera sees of the room.
 
     Attributes:
@@ -74,15 +79,15 @@ class Room:
         self._extents = shapes[:, :, ::-1].astype(np.float32)
 
     def is_free(self, points: np.ndarray, margin: float = 0.0) -> np.ndarray:
-        """Whether points (N, 3) are inside the walls and outside all solids by more than `margin` metres: (N,) bool."""
+        """Return whether points (N, 3) are inside the walls and outside all solids by `margin` metres: (N,) bool."""
         shell, *furniture = self.solids
         free = shell.distance(points) < -margin
         for solid in furniture:
             free &= solid.distance(points) > margin
         return free
 
-    def trace(self, camera: Camera, T_map_camera: np.ndarray, samples: int = 2) -> Trace:
-        """See the room through the lens of `camera`, its distortion included, from a pose (4, 4) inside the room.
+    def ray_trace(self, camera: Camera, T_map_camera: np.ndarray, samples: int = 2) -> RayTrace:
+        """Return what is seen through the lens of `camera`, its distortion included, from a pose (4, 4) in the room.
 
         The colour of a pixel is the mean of `samples` x `samples` rays through it.
         """
@@ -91,10 +96,10 @@ class Room:
         for x in offsets:
             for y in offsets:
                 total += self.cast(pixel_rays(camera, (x, y)), T_map_camera)[0]
-        return Trace(total / samples**2, self.cast(pixel_rays(camera), T_map_camera)[1])
+        return RayTrace(total / samples**2, self.cast(pixel_rays(camera), T_map_camera)[1])
 
     def cast(self, rays: np.ndarray, T_map_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Colours (H, W, 3) float32 in [0, 1] and z-depths (H, W) in metres at the ends of `rays` (H, W, 3).
+        """Return colours (H, W, 3) float32 in [0, 1] and z-depths (H, W) in metres at the ends of `rays` (H, W, 3).
 
         The rays are directions in the camera frame with z = 1; the camera is inside the room.
         """
@@ -111,11 +116,11 @@ class Room:
             depth[candidates[closer]], hit[candidates[closer]] = t[closer], index
         points = origin.astype(np.float32) + depth[:, None] * directions
         texels = self._texels(points, hit).reshape(height, width, 2)
-        colours = cv2.remap(self._atlas, texels, None, cv2.INTER_LINEAR)
+        colours = cv2.remap(self._atlas, texels, None, cv2.INTER_LINEAR)  # type: ignore[call-overload]
         return colours.astype(np.float32) / 255, depth.reshape(height, width)
 
     def _texels(self, points: np.ndarray, hit: np.ndarray) -> np.ndarray:
-        """Where in the atlas (N, 2) the surface points (N, 3) of the solids `hit` (N,) are."""
+        """Return where in the atlas (N, 2) the surface points (N, 3) of the solids `hit` (N,) are."""
         texels = np.empty((len(points), 2), np.float32)
         for index, solid in enumerate(self.solids):
             rows = np.flatnonzero(hit == index)
@@ -128,14 +133,14 @@ class Room:
 
 
 def pixel_rays(camera: Camera, offset: tuple[float, float] = (0.0, 0.0)) -> np.ndarray:
-    """Camera-frame directions (H, W, 3) float32, z = 1, of the observed pixels' centres moved by `offset` pixels."""
+    """Return directions (H, W, 3) float32 in the camera frame, z = 1, of the pixels' centres moved by `offset`."""
     columns, rows = np.meshgrid(np.arange(camera.width) + offset[0], np.arange(camera.height) + offset[1])
     pixels = np.column_stack([columns.ravel(), rows.ravel()])
     return camera.rays(camera.undistort(pixels)).reshape(camera.height, camera.width, 3).astype(np.float32)
 
 
 def _may_meet(solids: Sequence[Solid], origin: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Whether rays (N, 3) meet the spheres that hold the S solids: (S, N) bool."""
+    """Return whether rays (N, 3) meet the spheres that hold the S solids: (S, N) bool."""
     towards = np.array([solid.centre - origin for solid in solids])
     distances = np.linalg.norm(towards, axis=1, keepdims=True)
     radii = np.array([[solid.radius] for solid in solids])
@@ -146,7 +151,7 @@ def _may_meet(solids: Sequence[Solid], origin: np.ndarray, directions: np.ndarra
 
 
 def _paint_face(rng: np.random.Generator, solid: Solid, face: int) -> np.ndarray:
-    """The picture on a face: rows run along v, columns along u."""
+    """Paint the picture of a face: rows run along v, columns along u."""
     cols, rows = np.maximum(np.rint(solid.face_size(face) / _TEXEL), 1).astype(int)
     picture = paint(rng, rows, cols, _TEXEL)
     _, normals = solid.face_points(face, grid_uv(rows, cols))
@@ -155,6 +160,6 @@ def _paint_face(rng: np.random.Generator, solid: Solid, face: int) -> np.ndarray
 
 
 def grid_uv(rows: int, cols: int) -> np.ndarray:
-    """Positions (rows * cols, 2) on a face of the middles of the cells of a grid, row by row."""
+    """Return positions (rows * cols, 2) on a face of the middles of the cells of a grid, row by row."""
     u, v = np.meshgrid((np.arange(cols) + 0.5) / cols * 2 - 1, (np.arange(rows) + 0.5) / rows * 2 - 1)
     return np.column_stack([u.ravel(), v.ravel()])

@@ -1,4 +1,4 @@
-"""A camera that moves, distorts, blurs, drifts in exposure and is noisy, like a real one."""
+"""A camera whose photos are distorted, blurred by motion, noisy, and of drifting exposure, like those of a real one."""
 
 from __future__ import annotations
 
@@ -9,43 +9,43 @@ import numpy as np
 from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.simulate.room import Room, pixel_rays
 
-# Where in the pixel (pixels) each moment of the exposure looks: five rooks on a board, so that none attack another.
-_OFFSETS = ((0.0, 0.0), (-0.4, 0.2), (0.2, 0.4), (0.4, -0.2), (-0.2, -0.4))
+# Offsets in pixels of the ray of each moment of the exposure: five, none in the row or column of another.
+_SUBPIXEL_OFFSETS = ((0.0, 0.0), (-0.4, 0.2), (0.2, 0.4), (0.4, -0.2), (-0.2, -0.4))
 # Seconds that the shutter is open.
-_EXPOSURE = 0.01
+_EXPOSURE_TIME = 0.01
 _GAMMA = 2.2
-# Electrons of a white pixel, and the standard deviation of reading it.
+# Electrons of a white pixel, and the standard deviation of the noise of reading it.
 _FULL_WELL = 4000.0
 _READ_NOISE = 6.0
-# Standard deviations of the logarithm of the exposure, and of each colour's balance, from photo to photo.
-_EXPOSURE_DRIFT = 0.15
-_BALANCE_DRIFT = 0.03
+# Standard deviations of the logarithms of the exposure and of the gain of each colour, from photo to photo.
+_EXPOSURE_SIGMA = 0.15
+_WHITE_BALANCE_SIGMA = 0.03
 
 
 class RoomCamera:
-    """Takes photos of a room through the lens of `camera`."""
+    """A camera in a room: takes photos through the lens of `camera`."""
 
     def __init__(self, room: Room, camera: Camera) -> None:
         self._room = room
-        self._rays = [pixel_rays(camera, offset) for offset in _OFFSETS]
+        self._rays = [pixel_rays(camera, offset) for offset in _SUBPIXEL_OFFSETS]
         centre = self._rays[0]
         # A lens gathers light with the fourth power of the cosine of the angle from its axis.
         self._vignetting = (np.einsum("ijk,ijk->ij", centre, centre) ** -2.0)[:, :, None]
 
     def photo(self, pose_at: Callable[[float], np.ndarray], time: float, rng: np.random.Generator) -> np.ndarray:
-        """The photo (H, W, 3) uint8 RGB of an exposure centred at `time` in seconds.
+        """Return the photo (H, W, 3) uint8 RGB of an exposure centred at `time` in seconds.
 
-        `pose_at` gives T_map_camera (4, 4) at a time. Each moment of the exposure also looks at its own place in the
-        pixels, which smooths edges at no extra cost.
+        `pose_at` returns T_map_camera (4, 4) at a time. Each moment of the exposure also has its own sub-pixel offset,
+        which smooths edges at no extra cost.
         """
-        moments = time + _EXPOSURE * ((np.arange(len(self._rays)) + 0.5) / len(self._rays) - 0.5)
+        moments = time + _EXPOSURE_TIME * ((np.arange(len(self._rays)) + 0.5) / len(self._rays) - 0.5)
         # The middle of the pixel is seen in the middle of the exposure.
         order = (1, 3, 0, 2, 4)
         seen = [
             self._room.cast(self._rays[index], pose_at(moment))[0] for index, moment in zip(order, moments, strict=True)
         ]
         light = np.mean(seen, axis=0) ** _GAMMA * self._vignetting
-        light *= np.exp(rng.normal(0, _EXPOSURE_DRIFT) + rng.normal(0, _BALANCE_DRIFT, 3))
+        light *= np.exp(rng.normal(0, _EXPOSURE_SIGMA) + rng.normal(0, _WHITE_BALANCE_SIGMA, 3))
         return _develop(light, rng)
 
 

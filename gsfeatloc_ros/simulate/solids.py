@@ -32,19 +32,17 @@ class Box:
     R_map_solid: np.ndarray = field(init=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "centre", np.asarray(self.centre, dtype=np.float64))
-        object.__setattr__(self, "size", np.asarray(self.size, dtype=np.float64))
         object.__setattr__(self, "R_map_solid", so3_exp(np.array([0.0, 0.0, self.yaw])))
 
     @property
     def radius(self) -> float:
-        """Radius of the sphere around the centre that holds the solid."""
+        """Return the radius of the sphere around the centre that holds the solid."""
         return 0.5 * float(np.linalg.norm(self.size))
 
     def intersect(self, origin: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Smallest t > 0 (N,) at which `origin + t * directions` (N, 3) meets the surface; inf where it does not.
+        """Return the smallest t > 0 (N,) where `origin + t * directions` (N, 3) meets the surface; inf if none.
 
-        Slabs (Kay and Kajiya, 1986). From inside, the ray meets the surface where it leaves.
+        By slabs (Kay and Kajiya, 1986). From inside, the ray meets the surface where it leaves.
         """
         start = ((origin - self.centre) @ self.R_map_solid).astype(directions.dtype)
         local = rotate(self.R_map_solid.T, directions)
@@ -52,29 +50,29 @@ class Box:
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             low, high = (-half - start) / local, (half - start) / local
         # fmax and fmin: a ray that runs in a slab's border plane gives 0 / 0 there, which says nothing about it.
-        enter = np.fmax.reduce(np.minimum(low, high), axis=1)
-        leave = np.fmin.reduce(np.maximum(low, high), axis=1)
+        enter: np.ndarray = np.fmax.reduce(np.minimum(low, high), axis=1)
+        leave: np.ndarray = np.fmin.reduce(np.maximum(low, high), axis=1)
         t = np.where(enter > 0, enter, leave)
         return np.where((enter <= leave) & (t > 0), t, np.inf)
 
     def distance(self, points: np.ndarray) -> np.ndarray:
-        """Signed distance (N,) of points (N, 3) from the surface, negative inside (a lower bound outside corners)."""
+        """Return the signed distance (N,) of points (N, 3) from the surface, negative inside (less outside corners)."""
         return (np.abs((points - self.centre) @ self.R_map_solid) - 0.5 * self.size).max(axis=1)
 
     def grown(self, margin: float) -> Box:
-        """The box with every face moved outwards by `margin` metres."""
+        """Return the box with every face moved outwards by `margin` metres."""
         return Box(self.centre, self.size + 2 * margin, self.yaw)
 
     def face_size(self, face: int) -> np.ndarray:
-        """Lengths (2,) in metres of a face along u and v."""
+        """Return lengths (2,) in metres of a face along u and v."""
         return self.size[_FACE_AXES[face // 2]]
 
     def locate(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Faces (N,) and positions (N, 2) of points (N, 3) on the surface."""
+        """Return faces (N,) and positions (N, 2) of points (N, 3) on the surface."""
         return _face_of(self._to_cube(points))
 
     def face_points(self, face: int, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Points and outward unit normals (N, 3) in the map frame at the positions `uv` (N, 2) of a face."""
+        """Return points and outward unit normals (N, 3) in the map frame at the positions `uv` (N, 2) of a face."""
         cube = _on_face(face, uv)
         normal = np.zeros(3)
         normal[face // 2] = 1.0 if face % 2 else -1.0
@@ -98,11 +96,8 @@ class Sphere:
     centre: np.ndarray
     radius: float
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "centre", np.asarray(self.centre, dtype=np.float64))
-
     def intersect(self, origin: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Smallest t > 0 (N,) at which `origin + t * directions` (N, 3) meets the surface; inf where it does not."""
+        """Return the smallest t > 0 (N,) where `origin + t * directions` (N, 3) meets the surface; inf if none."""
         start = (origin - self.centre).astype(directions.dtype)
         square = np.einsum("ij,ij->i", directions, directions)
         nearest = -(directions @ start) / square
@@ -114,24 +109,24 @@ class Sphere:
         return np.where((reach_squared >= 0) & (t > 0), t, np.inf)
 
     def distance(self, points: np.ndarray) -> np.ndarray:
-        """Signed distance (N,) of points (N, 3) from the surface, negative inside."""
+        """Return the signed distance (N,) of points (N, 3) from the surface, negative inside."""
         return np.linalg.norm(points - self.centre, axis=1) - self.radius
 
     def grown(self, margin: float) -> Sphere:
-        """The sphere with its radius longer by `margin` metres."""
+        """Return the sphere with its radius longer by `margin` metres."""
         return Sphere(self.centre, self.radius + margin)
 
     def face_size(self, face: int) -> np.ndarray:
-        """Lengths (2,) in metres of a face along u and v through its middle: a quarter of a great circle each."""
+        """Return lengths (2,) in metres of a face along u and v through its middle: quarters of great circles."""
         return np.full(2, 0.5 * np.pi * self.radius)
 
     def locate(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Faces (N,) and positions (N, 2) of points (N, 3) on the surface."""
+        """Return faces (N,) and positions (N, 2) of points (N, 3) on the surface."""
         faces, uv = _face_of(points - self.centre.astype(points.dtype))
         return faces, np.arctan(uv) * (4.0 / np.pi)
 
     def face_points(self, face: int, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Points and outward unit normals (N, 3) in the map frame at the positions `uv` (N, 2) of a face."""
+        """Return points and outward unit normals (N, 3) in the map frame at the positions `uv` (N, 2) of a face."""
         cube = _on_face(face, np.tan(uv * (np.pi / 4.0)))
         normals = cube / np.linalg.norm(cube, axis=1, keepdims=True)
         return self.centre + self.radius * normals, normals
@@ -149,7 +144,7 @@ def rotate(rotation: np.ndarray, vectors: np.ndarray) -> np.ndarray:
 
 
 def _face_of(cube: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Faces (N,) of the cube that the rays from its middle through `cube` (N, 3) meet, and where (N, 2) on them."""
+    """Return faces (N,) of the cube that the rays from its middle through `cube` (N, 3) meet, and where (N, 2)."""
     rows = np.arange(len(cube))
     axis = np.abs(cube).argmax(axis=1)
     along = cube[rows, axis]
@@ -158,7 +153,7 @@ def _face_of(cube: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _on_face(face: int, uv: np.ndarray) -> np.ndarray:
-    """Points (N, 3) of the cube [-1, 1]^3 at the positions `uv` (N, 2) of a face."""
+    """Return points (N, 3) of the cube [-1, 1]^3 at the positions `uv` (N, 2) of a face."""
     cube = np.empty((len(uv), 3))
     cube[:, face // 2] = 1.0 if face % 2 else -1.0
     cube[:, _FACE_AXES[face // 2]] = uv

@@ -12,7 +12,7 @@ _SHAPES = ((0.4, 1.0, 1.5), (0.15, 0.4, 8.0), (0.07, 0.15, 30.0), (0.04, 0.07, 4
 
 
 def paint(rng: np.random.Generator, rows: int, cols: int, texel: float) -> np.ndarray:
-    """A random picture (rows, cols, 3) uint8 whose pixels are `texel` metres wide."""
+    """Paint a random picture (rows, cols, 3) uint8 whose pixels are `texel` metres wide."""
     canvas = np.empty((rows, cols, 3), np.uint8)
     canvas[:] = rng.uniform(120, 210, 3)
     palette = _palette(rng, 12)
@@ -31,7 +31,7 @@ def paint(rng: np.random.Generator, rows: int, cols: int, texel: float) -> np.nd
 
 
 def _palette(rng: np.random.Generator, count: int) -> np.ndarray:
-    """Colours (count, 3) from dark to light, none glaring."""
+    """Return colours (count, 3) from dark to light, none glaring."""
     brightness = rng.permutation(np.linspace(20, 235, count))[:, None]
     return np.clip(brightness + rng.normal(0, 30, (count, 3)), 0, 255)
 
@@ -40,22 +40,22 @@ def _draw_shape(
     rng: np.random.Generator, canvas: np.ndarray, centre: np.ndarray, size: float, colour: np.ndarray
 ) -> None:
     """Draw one shape about `size` pixels wide: an ellipse, a ring, a polygon, a rectangle or a stroke."""
-    colour = tuple(colour.tolist())
+    ink = colour.tolist()
     middle, angle = tuple(np.rint(centre).astype(int).tolist()), rng.uniform(0, 360)
     match rng.integers(5):
         case 0:
             axes = (int(size / 2), int(size / 2 * rng.uniform(0.4, 1.0)))
-            cv2.ellipse(canvas, middle, axes, angle, 0, 360, colour, cv2.FILLED, cv2.LINE_AA)
+            cv2.ellipse(canvas, middle, axes, angle, 0, 360, ink, cv2.FILLED, cv2.LINE_AA)
         case 1:
-            cv2.circle(canvas, middle, int(size / 2), colour, max(2, int(size * 0.15)), cv2.LINE_AA)
+            cv2.circle(canvas, middle, int(size / 2), ink, max(2, int(size * 0.15)), cv2.LINE_AA)
         case 2:
             angles = np.sort(rng.uniform(0, 2 * np.pi, rng.integers(3, 8)))
-            corners = centre + size / 2 * np.column_stack([np.cos(angles), np.sin(angles)])
-            cv2.fillPoly(canvas, [np.rint(corners).astype(np.int32)], colour, cv2.LINE_AA)
+            polygon = centre + size / 2 * np.column_stack([np.cos(angles), np.sin(angles)])
+            cv2.fillPoly(canvas, [np.rint(polygon).astype(np.int32)], ink, cv2.LINE_AA)
         case 3:
             corners = cv2.boxPoints((centre.tolist(), (size, size * rng.uniform(0.3, 0.9)), angle))
-            cv2.fillPoly(canvas, [np.rint(corners).astype(np.int32)], colour, cv2.LINE_AA)
+            cv2.fillPoly(canvas, [np.rint(corners).astype(np.int32)], ink, cv2.LINE_AA)
         case _:
             step = size / 2 * np.array([np.cos(angle), np.sin(angle)])
-            ends = [tuple(np.rint(end).astype(int).tolist()) for end in (centre - step, centre + step)]
-            cv2.line(canvas, *ends, colour, max(2, int(size * 0.12)), cv2.LINE_AA)
+            start, end = (np.rint(point).astype(int).tolist() for point in (centre - step, centre + step))
+            cv2.line(canvas, start, end, ink, max(2, int(size * 0.12)), cv2.LINE_AA)

@@ -31,8 +31,8 @@ _OPACITIES = (0.9, 0.8)
 _HARMONICS = (0.1, 0.05, 0.03)
 
 
-def _looking(position: tuple[float, float, float], target: tuple[float, float, float]) -> np.ndarray:
-    """Pose (4, 4) T_map_camera of an upright camera."""
+def _looking_at(position: tuple[float, float, float], target: tuple[float, float, float]) -> np.ndarray:
+    """Return the pose T_map_camera (4, 4) of an upright camera."""
     forward = np.subtract(target, position) / np.linalg.norm(np.subtract(target, position))
     right = np.cross(forward, (0.0, 0.0, 1.0))
     right /= np.linalg.norm(right)
@@ -41,8 +41,8 @@ def _looking(position: tuple[float, float, float], target: tuple[float, float, f
 
 # What to measure from, T_map_camera (4, 4) by name: most of the map in view, and as on a robot's way.
 VIEWS = {
-    "everything": _looking((1.2, 2.9, 2.1), (6.0, 1.8, 1.1)),
-    "typical": _looking((4.8, 3.8, 1.6), (0.8, 1.2, 0.9)),
+    "everything": _looking_at((1.2, 2.9, 2.1), (6.0, 1.8, 1.1)),
+    "typical": _looking_at((4.8, 3.8, 1.6), (0.8, 1.2, 0.9)),
 }
 
 
@@ -68,7 +68,7 @@ def two_rooms(count: int, seed: int = 0) -> GaussianMap:
 
 
 def _scatter(count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, float]:
-    """Points (N, 3) float32 on the boxes' faces, the axes (N,) along their normals, and the distance of neighbours."""
+    """Return points (N, 3) float32 on the boxes, the axes (N,) along their normals, and the distance of neighbours."""
     corners = np.array(_BOXES)
     sizes = corners[:, 1] - corners[:, 0]
     # Of the two faces across each axis.
@@ -85,7 +85,7 @@ def _scatter(count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarr
 
 
 def _colours(means: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Harmonics (N, 16, 3) float32 of waves of colour, as coarse as tiles and as fine as text."""
+    """Return harmonics (N, 16, 3) float32 of waves of colour, as coarse as tiles and as fine as text."""
     sh = np.zeros((len(means), SH_COEFFICIENTS[-1], 3), np.float32)
     for wavelength in (1.0, 0.3, 0.08):
         for channel in range(3):

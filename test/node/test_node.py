@@ -52,7 +52,7 @@ def test_rendered_image_is_the_map_seen_from_the_estimate(client, room, room_cam
     rendered = np.frombuffer(render.data, np.uint8).reshape(render.height, render.width, 3) / 255.0
     # The room as a pinhole camera at the true pose would see it.
     pinhole = replace(room_camera.scaled(render.width, render.height), distortion=np.zeros(0))
-    seen = room.trace(pinhole, photo.T_map_camera).rgb
+    seen = room.ray_trace(pinhole, photo.T_map_camera).rgb
     assert np.corrcoef(rendered.ravel(), seen.ravel())[0, 1] > 0.9
 
 

@@ -205,7 +205,7 @@ def test_nerf_synthetic(tmp_path, room, room_map_file, small_camera, small_photo
     camera = Camera(320, 240, np.array([[260.0, 0, 159.5], [0, 260.0, 119.5], [0, 0, 1]]))
     poses = [simulated.T_map_camera for simulated in small_photos]
     photo = np.full((240, 320, 4), 255, np.uint8)
-    photo[..., :3] = np.rint(255 * room.trace(camera, poses[7]).rgb)
+    photo[..., :3] = np.rint(255 * room.ray_trace(camera, poses[7]).rgb)
     photo[:30, :40, 3] = 0
     splits = {"train": poses[:5], "val": poses[5:7], "test": poses[7:8]}
     folder = write_nerf_synthetic(tmp_path, angle_x(camera), splits, [photo])

@@ -14,13 +14,13 @@ from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.geometry import make_pose, matrix_from_quaternion, rotation_error_deg, translation_error
 from gsfeatloc_ros.render import create_renderer
 from gsfeatloc_ros.simulate import Room, simulate_photos, write_bag
-from gsfeatloc_ros.simulate.photos import CLEARANCE, PRIOR_ROTATION_DEG, PRIOR_TRANSLATION, Walk, look
+from gsfeatloc_ros.simulate.photos import MIN_CLEARANCE, PRIOR_ROTATION_DEG, PRIOR_TRANSLATION, Walk, facing
 from gsfeatloc_ros.simulate.room import pixel_rays
 from gsfeatloc_ros.simulate.room_camera import RoomCamera
 from gsfeatloc_ros.simulate.solids import Box, Sphere
 
-BOX = Box((0.5, -0.2, 0.3), (1.0, 0.6, 0.8), yaw=0.4)
-SPHERE = Sphere((0.5, -0.2, 0.3), 0.7)
+BOX = Box(np.array([0.5, -0.2, 0.3]), np.array([1.0, 0.6, 0.8]), yaw=0.4)
+SPHERE = Sphere(np.array([0.5, -0.2, 0.3]), 0.7)
 solids = pytest.mark.parametrize("solid", [BOX, SPHERE], ids=["box", "sphere"])
 
 coordinates = st.floats(-3, 3)
@@ -35,7 +35,7 @@ def psnr(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def test_ray_meets_the_near_face_of_a_box():
-    box = Box((2.0, 0.0, 0.0), (1.0, 1.0, 1.0))
+    box = Box(np.array([2.0, 0.0, 0.0]), np.ones(3))
     directions = np.array([[1.0, 0, 0], [2.0, 0, 0], [-1.0, 0, 0], [0, 1.0, 0]])
     np.testing.assert_allclose(box.intersect(np.zeros(3), directions), [1.5, 0.75, np.inf, np.inf])
 
@@ -47,7 +47,7 @@ def test_ray_from_inside_meets_a_solid_where_it_leaves():
 
 
 def test_ray_meets_a_sphere_as_the_quadratic_formula_says():
-    sphere = Sphere((4.0, 0.0, 0.0), 1.0)
+    sphere = Sphere(np.array([4.0, 0.0, 0.0]), 1.0)
     directions = np.array([[1.0, 0, 0], [1.0, 0.2, 0], [1.0, 0.5, 0]])
     # |t (1, 0.2) - (4, 0)| = 1 for the second; the third passes by.
     expected = [3.0, (8 - np.sqrt(64 - 4 * 1.04 * 15)) / (2 * 1.04), np.inf]
@@ -86,7 +86,7 @@ def test_place_on_a_face_is_found_again(solid, face, u, v):
 def test_ceiling_is_seen_at_its_height_and_in_its_colours(room, room_camera):
     """A camera under the bare ceiling, its axes those of the map, z up."""
     pose = make_pose(np.eye(3), np.array([1.4, 1.1, 2.0]))
-    trace = room.trace(room_camera, pose, samples=1)
+    trace = room.ray_trace(room_camera, pose, samples=1)
     np.testing.assert_allclose(trace.depth, 1.0, atol=1e-5)
     # From the observed pixel to the ceiling, one metre up, by OpenCV alone.
     rows, cols = np.mgrid[40:480:80, 40:640:80]
@@ -112,14 +112,14 @@ def test_rays_of_the_pixels_are_those_that_the_lens_bends_onto_them(room_camera)
 
 def test_nearest_solid_hides_the_others(room):
     """Straight down from above the ball on the table: the ball, then beside it the table, then the floor."""
-    pose = make_pose(look(0.0, -np.pi / 2), np.array([-0.25, 0.0, 2.0]))
+    pose = make_pose(facing(0.0, -np.pi / 2), np.array([-0.25, 0.0, 2.0]))
     camera = Camera(1, 1, np.eye(3))
     rays = np.array([[[0.0, 0.0, 1.0]]], np.float32)
     ball = room.cast(rays, pose)[1]
     pose[:3, 3] = [-0.1, -0.25, 2.0]
     table = room.cast(rays, pose)[1]
     pose[:3, 3] = [1.4, 0.0, 2.0]
-    floor = room.trace(camera, pose, samples=1).depth
+    floor = room.ray_trace(camera, pose, samples=1).depth
     np.testing.assert_allclose([ball.item(), table.item(), floor.item()], [2.0 - 1.03 - 0.23, 1.2, 2.0], atol=1e-5)
 
 
@@ -137,7 +137,7 @@ def test_rooms_of_a_seed_are_the_same_and_of_another_are_not(room):
 def test_walk_keeps_clear_of_everything(room, seed, time):
     walk = Walk(np.random.default_rng(seed).uniform(0, 2 * np.pi, 4))
     pose = walk.pose(time)
-    assert room.is_free(pose[None, :3, 3], CLEARANCE)[0]
+    assert room.is_free(pose[None, :3, 3], MIN_CLEARANCE)[0]
     np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-12)
     # It holds the camera upright: image down points down in the room.
     assert pose[2, 1] < -0.8
@@ -157,7 +157,7 @@ def test_photos_have_priors_in_free_space(room, room_camera, room_photos):
         assert PRIOR_ROTATION_DEG[0] <= degrees <= PRIOR_ROTATION_DEG[1]
         metres = translation_error(photo.T_map_camera, photo.T_map_camera_prior)
         assert PRIOR_TRANSLATION[0] <= metres <= PRIOR_TRANSLATION[1]
-        assert room.is_free(photo.T_map_camera_prior[None, :3, 3], CLEARANCE)[0]
+        assert room.is_free(photo.T_map_camera_prior[None, :3, 3], MIN_CLEARANCE)[0]
 
 
 def test_photos_of_a_seed_are_the_same(room, room_camera, room_photos):
@@ -184,7 +184,7 @@ def test_still_photo_is_what_the_tracer_sees_but_for_light_and_noise(room, small
     pose = room_photos[0].T_map_camera
     middle = np.s_[70:170, 110:210]  # the corners are darker
     photo = take_photo(photographer, lambda time: pose)[middle]
-    seen = room.trace(small_camera, pose, samples=3).rgb[middle]
+    seen = room.ray_trace(small_camera, pose, samples=3).rgb[middle]
     gains = (photo * seen).sum((0, 1)) / (seen**2).sum((0, 1))
     assert psnr(photo, gains * seen) > 28
 
@@ -200,14 +200,16 @@ def test_photos_differ_in_exposure_and_noise(photographer, room_photos):
 
 def test_corners_of_photos_are_darker(room, small_camera, photographer, room_photos):
     pose = room_photos[0].T_map_camera
-    ratio = take_photo(photographer, lambda time: pose) / np.maximum(room.trace(small_camera, pose, samples=1).rgb, 0.1)
+    ratio = take_photo(photographer, lambda time: pose) / np.maximum(
+        room.ray_trace(small_camera, pose, samples=1).rgb, 0.1
+    )
     assert np.median(ratio[:40, :40]) < 0.9 * np.median(ratio[100:140, 140:180])
 
 
 def test_motion_blurs(photographer, room_photos):
     place = room_photos[0].T_map_camera[:3, 3]
-    sharp = take_photo(photographer, lambda time: make_pose(look(0.0, -0.2), place))
-    blurred = take_photo(photographer, lambda time: make_pose(look(3.0 * time, -0.2), place))
+    sharp = take_photo(photographer, lambda time: make_pose(facing(0.0, -0.2), place))
+    blurred = take_photo(photographer, lambda time: make_pose(facing(3.0 * time, -0.2), place))
     # The camera turns about the vertical: what changes from left to right is lost.
     across = [np.abs(np.diff(photo.mean(axis=2), axis=1)).mean() for photo in (sharp, blurred)]
     assert across[1] < 0.8 * across[0]
@@ -220,7 +222,7 @@ def test_map_looks_like_the_room(room, room_map, room_camera, room_photos):
     pinhole = Camera(room_camera.width, room_camera.height, room_camera.K)
     renderer = create_renderer(room_map)
     for photo in room_photos[::4]:
-        trace, render = room.trace(pinhole, photo.T_map_camera), renderer.render(pinhole, photo.T_map_camera)
+        trace, render = room.ray_trace(pinhole, photo.T_map_camera), renderer.render(pinhole, photo.T_map_camera)
         assert psnr(render.rgb, trace.rgb) > 21
         assert render.alpha.mean() > 0.99
         assert np.nanmedian(np.abs(render.depth - trace.depth)) < 0.006

@@ -38,7 +38,7 @@ def cover(room: Room, spacing: float = 0.028) -> GaussianMap:
 
 
 def _layer(room: Room, spacing: float, spread: float, depth: float) -> tuple[np.ndarray, ...]:
-    """Discs `depth` metres under the surfaces: centres (N, 3), normals (N, 3), widths (N,) and colours (N, 3)."""
+    """Return discs `depth` metres under the surfaces: centres (N, 3), normals (N, 3), widths (N,), colours (N, 3)."""
     means, normals, widths, colours = [], [], [], []
     for index, solid in enumerate(room.solids):
         # The walls, the first of the solids, are seen from inside.
@@ -58,13 +58,13 @@ def _layer(room: Room, spacing: float, spread: float, depth: float) -> tuple[np.
 
 
 def _sharpened(picture: np.ndarray, rows: int, cols: int, spread: float) -> np.ndarray:
-    """Colours (rows, cols, 3) in [0, 1] of the discs of a face."""
+    """Return colours (rows, cols, 3) in [0, 1] of the discs of a face."""
     colours = cv2.resize(picture, (int(cols), int(rows)), interpolation=cv2.INTER_AREA).astype(np.float32) / 255
     return np.clip(colours + _SHARPEN * (colours - cv2.GaussianBlur(colours, (0, 0), spread)), 0, 1)
 
 
 def _turning_z_to(normals: np.ndarray) -> np.ndarray:
-    """Unit quaternions wxyz (N, 4) of the shortest rotations that turn the z axis into unit vectors (N, 3)."""
+    """Return unit quaternions wxyz (N, 4) of the shortest rotations that turn the z axis into unit vectors (N, 3)."""
     x, y, z = normals.T
     quaternions = np.column_stack([1 + z, -y, x, np.zeros(len(z))])
     # Straight down, there is no shortest one: any half turn does.
