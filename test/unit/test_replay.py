@@ -140,6 +140,7 @@ def test_other_types_of_messages(room_camera, room_photos, room_map_file, tmp_pa
     assert "truth known for 1 of the 2 answers" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_the_command_needs_no_ros(room_camera, room_photos, room_map_file, tmp_path):
     write_bag(tmp_path / "bag", room_camera, room_photos[:1])
     hide = "import sys; sys.modules.update(dict.fromkeys(['rclpy', 'sensor_msgs', 'geometry_msgs']));"
