@@ -141,6 +141,7 @@ def test_parts_are_taken_out_and_photos_corrupted_one_at_a_time(room_scene, tmp_
         assert (f"{old} is now {new}; the old name works until the next release" in said) == (ablation == "--without")
 
 
+@pytest.mark.slow
 def test_the_old_name_of_a_localizer_option_works_with_a_notice(room_scene, tmp_path, capsys):
     path = tmp_path / "report.json"
     assert main([str(room_scene), *QUICK, "--set", "min_agreement=1.0", "--limit", "1", "--json", str(path)]) == 0
