@@ -46,7 +46,13 @@ from gsfeatloc_ros.simulate import write_bag
 from gsfeatloc_ros.simulate.bag_messages import header, make
 from gsfeatloc_ros.tools.replay import main
 
-storages = pytest.mark.parametrize("storage", [StoragePlugin.MCAP, StoragePlugin.SQLITE3], ids=["mcap", "sqlite3"])
+storages = pytest.mark.parametrize(
+    "storage",
+    [
+        pytest.param(StoragePlugin.MCAP, id="mcap"),
+        pytest.param(StoragePlugin.SQLITE3, id="sqlite3", marks=pytest.mark.slow),
+    ],
+)
 # A slow, shared machine is no reason to fail.
 unhurried = settings(deadline=None, max_examples=25, suppress_health_check=list(HealthCheck))
 
