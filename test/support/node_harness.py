@@ -40,6 +40,8 @@ from gsfeatloc_ros.simulate import SimulatedPhoto
 
 # How long to listen before saying that nothing was published.
 SILENCE = 1.0
+# Whom a client has found may take so long to find the client too: what is sent before that is lost.
+SETTLING = 0.5
 # Best effort may lose an image: it is sent again after this.
 RESEND_PERIOD = 3.0
 
@@ -151,6 +153,7 @@ class Client(ClientNode):
             self._publishers[topic] = self.node.create_publisher(message_type, topic, 10)
             heard = self.spin_until(lambda: self._publishers[topic].get_subscription_count() > 0)
             assert heard, f"nobody listens to {topic}"
+            self.spin(SETTLING)
         return self._publishers[topic]
 
     def publish(self, topic: str, message: object) -> None:
@@ -163,8 +166,7 @@ class Client(ClientNode):
         if name not in self._services:
             self._services[name] = self.node.create_client(service_type, name)
             assert self.spin_until(self._services[name].service_is_ready), f"there is no service {name}"
-            # The service may take a moment longer to find this client, and would lose its first answer.
-            self.spin(0.5)
+            self.spin(SETTLING)
         assert self.spin_until(self._services[name].service_is_ready), f"there is no service {name} any more"
         future = self._services[name].call_async(request)
         assert self.spin_until(future.done, timeout), f"no answer from {name}"
