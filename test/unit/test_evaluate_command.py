@@ -92,6 +92,7 @@ def test_sweep_is_reported_by_step(room_scene, tmp_path, capsys):
     assert capsys.readouterr().out.count("prior off by") == 11
 
 
+@pytest.mark.slow
 def test_priors_of_another_system(room_scene, photos, tmp_path):
     path = tmp_path / "report.json"
     prior = photos[2].T_map_camera_prior

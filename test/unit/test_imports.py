@@ -10,6 +10,8 @@ from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parents[2]
 # Each may import those before it. docs/architecture.md has the same list, from the top.
 ROOMS = [
@@ -116,6 +118,7 @@ def run(code: str) -> subprocess.CompletedProcess:
     return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300, cwd=ROOT)
 
 
+@pytest.mark.slow
 def test_all_others_can_be_imported_without_ros():
     others = [module for module in SOURCES if not talks_to_ros(module)]
     code = f"""

@@ -263,6 +263,7 @@ def nasty_gaussians(rng: np.random.Generator, count: int) -> GaussianMap:
     )
 
 
+@pytest.mark.slow
 @settings(max_examples=40, deadline=None)
 @given(seed=seeds, count=st.integers(1, 40), antialiased=st.booleans())
 def test_nasty_gaussians_do_no_harm(seed: int, count: int, antialiased: bool) -> None:
@@ -317,6 +318,7 @@ def wall(seed: int) -> GaussianMap:
     return replace(gaussian_map, means=means.astype(np.float32), scales=sizes.astype(np.float32))
 
 
+@pytest.mark.slow
 @settings(max_examples=40, deadline=None)
 @given(seed=seeds, focal=st.floats(5, 500), along_an_axis=st.booleans())
 def test_culling_drops_nothing_that_is_seen(seed: int, focal: float, along_an_axis: bool) -> None:

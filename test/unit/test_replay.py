@@ -104,6 +104,7 @@ def test_outputs_of_a_bag(storage, room_camera, room_photos, room_map_file, tmp_
     assert picture.std() > 10
 
 
+@pytest.mark.slow
 def test_answers_are_those_of_the_localizer(room_camera, room_photos, room_map_file, tmp_path):
     write_bag(tmp_path / "bag", room_camera, room_photos[:2])
     assert (

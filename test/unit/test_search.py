@@ -121,6 +121,7 @@ def test_views_that_share_nothing_are_not_followed(renderer, room_camera, room_p
     assert promising(seen(renderer, room_camera, room_photos[0].image, [])) == []
 
 
+@pytest.mark.slow
 def test_finds_a_camera_that_was_turned_away(renderer, room_camera, room_photos) -> None:
     """The prior looks at another wall. The prior's covariance says how far to look."""
     photo = room_photos[1]

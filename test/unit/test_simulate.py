@@ -180,6 +180,7 @@ def take_photo(photographer, pose_at, seed: int = 0) -> np.ndarray:
     return photographer.photo(pose_at, 0.0, np.random.default_rng(seed)).astype(np.float32) / 255
 
 
+@pytest.mark.slow
 def test_still_photo_is_what_the_tracer_sees_but_for_light_and_noise(room, small_camera, photographer, room_photos):
     pose = room_photos[0].T_map_camera
     middle = np.s_[70:170, 110:210]  # the corners are darker
@@ -218,6 +219,7 @@ def test_motion_blurs(photographer, room_photos):
 # The map
 
 
+@pytest.mark.slow
 def test_map_looks_like_the_room(room, room_map, room_camera, room_photos):
     pinhole = Camera(room_camera.width, room_camera.height, room_camera.K)
     renderer = create_renderer(room_map)
