@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import Enum
 
@@ -59,9 +60,12 @@ class Trace:
         render: the last render that was compared with the photo; None where there was none. Of an answer, it is within
             half a pixel of the estimate, and of the photo's size.
         correspondences: pixels of the inliers (photo, render).
+        changed: makes the mask of where the photo shows something else than the map: (H, W) uint8, 255 there; None
+            where no pose was found.
     """
 
     estimate: Estimate
     photo: Photo
     render: Render | None = None
     correspondences: Matches = field(default_factory=Matches.none)
+    changed: Callable[[], np.ndarray] | None = None

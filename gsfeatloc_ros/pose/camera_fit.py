@@ -1,0 +1,124 @@
+"""Whether the camera is as it was calibrated: parameters of the lens and the shutter, fitted along with the pose."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsfeatloc_ros.common.camera import Camera
+from gsfeatloc_ros.common.geometry import make_pose, skew, so3_exp, so3_log
+from gsfeatloc_ros.pose.solve import Correspondences, PoseOptions, shared_variance, whiten
+
+# Parameters beside the pose: focal length (relative), k1, and by how much the camera turns, in radians about its axes,
+# while the shutter runs from the first row to the last. What they are known to before a photo is seen, as standard
+# deviations: what photos do not show stays near zero.
+_PRIOR_SIGMAS = np.array([0.05, 0.1, 0.03, 0.03, 0.03])
+_ITERATIONS = 6
+
+
+@dataclass(frozen=True, eq=False)
+class CameraFit:
+    """How a camera differs from its calibration, by one photo.
+
+    Attributes:
+        focal: how much longer the focal length is, relative.
+        focal_sigma: its standard deviation.
+        k1: radial distortion (plumb_bob) that the calibration lacks.
+        k1_sigma: its standard deviation.
+        rolling: (3,) rotation vector of the camera, in its own axes and radians, from the first row to the last.
+        rolling_sigma: (3,) its standard deviations.
+        pose_shift: (6,) what the pose would be moved by, translation and rotation vector about the map's axes.
+    """
+
+    focal: float
+    focal_sigma: float
+    k1: float
+    k1_sigma: float
+    rolling: np.ndarray
+    rolling_sigma: np.ndarray
+    pose_shift: np.ndarray
+
+
+def fit_camera(
+    camera: Camera, T_map_camera: np.ndarray, found: Correspondences, options: PoseOptions
+) -> CameraFit | None:
+    """Fit the camera along with the pose, by Gauss-Newton on the whitened residuals with Cauchy's weights.
+
+    The principal point is no part of it: it cannot be told from a rotation.
+
+    Args:
+        camera: as calibrated, pinhole.
+        T_map_camera: (4, 4) the pose that the calibration gives.
+        found: matches near that pose.
+        options: of the solver.
+
+    Returns:
+        The fit; None where the matches do not determine it.
+    """
+    pose, extra = T_map_camera, np.zeros(len(_PRIOR_SIGMAS))
+    information = np.concatenate([np.zeros(6), 1.0 / _PRIOR_SIGMAS**2])
+    whitening = whiten(camera, pose, found)
+    if whitening is None:
+        return None
+    for iteration in range(_ITERATIONS + 1):
+        linear = _linearize(camera, pose, extra, found)
+        if linear is None:
+            return None
+        residuals, jacobian = linear
+        white = np.einsum("mij,mj->mi", whitening, residuals)
+        white_jacobian = whitening @ jacobian
+        squared = (white**2).sum(axis=1)
+        weights = 1.0 / (1.0 + squared / options.cauchy_scale**2)
+        weighted = (weights[:, None, None] * white_jacobian).reshape(-1, len(information))
+        hessian = weighted.T @ white_jacobian.reshape(-1, len(information)) + np.diag(information)
+        if iteration == _ITERATIONS:
+            break
+        gradient = weighted.T @ white.ravel() + information * np.concatenate([np.zeros(6), extra])
+        step = -np.linalg.solve(hessian, gradient)
+        pose = make_pose(so3_exp(step[3:6]) @ pose[:3, :3], pose[:3, 3] + step[:3])
+        extra = extra + step[6:]
+    inflation = max((weights * squared).sum() / max(2 * weights.sum() - len(information), 1.0), 1.0)
+    plain = (weights[:, None, None] * jacobian).reshape(-1, len(information))
+    of_a_match = plain.T @ jacobian.reshape(-1, len(information)) / weights.sum()
+    shared = shared_variance(found.pixels, residuals, options)
+    # What the matches have in common counts as one match with that error, beside what is known before.
+    covariance = inflation * np.linalg.inv(hessian) + np.linalg.inv(of_a_match / shared + np.diag(information))
+    sigmas = np.sqrt(np.diag(covariance))[6:]
+    shift = np.concatenate([pose[:3, 3] - T_map_camera[:3, 3], so3_log(pose[:3, :3] @ T_map_camera[:3, :3].T)])
+    return CameraFit(extra[0], sigmas[0], extra[1], sigmas[1], extra[2:], sigmas[2:], shift)
+
+
+def _linearize(
+    camera: Camera, pose: np.ndarray, extra: np.ndarray, found: Correspondences
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return residuals (M, 2) and their Jacobians (M, 2, 11) by pose and camera; None with points behind the camera."""
+    offsets = found.points - pose[:3, 3]
+    when = ((found.pixels[:, 1] + 0.5) / camera.height - 0.5)[:, None]
+    in_camera = offsets @ pose[:3, :3]
+    # The camera has turned by when * rolling as the row is read: to first order, as the angles are small.
+    in_camera = in_camera - np.cross(when * extra[2:], in_camera)
+    z = in_camera[:, 2:]
+    if not (z > 0).all():
+        return None
+    slopes = in_camera[:, :2] / z
+    radius2 = (slopes**2).sum(axis=1, keepdims=True)
+    focal = np.array([camera.K[0, 0], camera.K[1, 1]])
+    bent = 1 + extra[1] * radius2
+    projected = (1 + extra[0]) * focal * slopes * bent + camera.K[:2, 2]
+    by_point_in_camera = np.zeros((len(found.pixels), 2, 3))
+    by_point_in_camera[:, 0, 0], by_point_in_camera[:, 1, 1] = (1 + extra[0]) * focal
+    by_point_in_camera[:, :, 2] = -(1 + extra[0]) * focal * slopes
+    by_point_in_camera /= z[..., None]
+    by_point = by_point_in_camera @ pose[:3, :3].T
+    jacobian = np.concatenate(
+        [
+            -by_point,
+            by_point @ skew(offsets),
+            (focal * slopes * bent)[..., None],
+            ((1 + extra[0]) * focal * slopes * radius2)[..., None],
+            by_point_in_camera @ skew(in_camera) * when[..., None],
+        ],
+        axis=2,
+    )
+    return projected - found.pixels, jacobian
