@@ -53,7 +53,7 @@ def parameter(
 ) -> T:
     """Make a dataclass field that is a parameter; arguments as the attributes of Parameter."""
     about = Parameter("", cast(Value, default), description, bounds, choices, live)
-    return cast(T, field(default=default, metadata={_KEY: about}))
+    return field(default=default, metadata={_KEY: about})
 
 
 def parameters_of(settings: type, prefix: str = "") -> Iterator[Parameter]:

@@ -73,8 +73,8 @@ def _wall(coefficients: int, antialiased: bool) -> GaussianMap:
     sh[:, 0] = colours.reshape(-1, 3)
     return GaussianMap(
         means=means.astype(np.float32),
-        scales=np.tile(np.float32([0.5 * _SPACING, 0.5 * _SPACING, 0.001]), (x.size, 1)),
-        rotations=np.tile(np.float32([1, 0, 0, 0]), (x.size, 1)),
+        scales=np.tile(np.array([0.5 * _SPACING, 0.5 * _SPACING, 0.001], np.float32), (x.size, 1)),
+        rotations=np.tile(np.array([1, 0, 0, 0], np.float32), (x.size, 1)),
         opacities=np.full(x.size, 0.95, np.float32),
         sh=sh,
         antialiased=antialiased,
