@@ -55,13 +55,13 @@ class State(Enum):
     LOST = "LOST"
 
 
-# A share of corners found again in the next image below which track is lost.
-MIN_TRACKED = 0.3
+# Track is lost when fewer of the corners are found again in the next image.
+MIN_TRACKED_RATIO = 0.3
 # Standard deviations of the first prior that is sent, in metres and radians, and how many times wider they may get.
 FIRST_SIGMAS = np.array([0.05] * 3 + [0.05] * 3)
-WIDEST = 16.0
+MAX_WIDENING = 16.0
 # An answer whose standard deviations, in metres and radians, are larger is not good enough to go on from.
-USABLE_SIGMA = 0.05
+MAX_SIGMA = 0.05
 # Seconds until a request is given up.
 TIMEOUT = 30.0
 
@@ -86,28 +86,28 @@ class SlamStack(Node):
         # Of what is asked for while lost: the answer to come, when it is given up, how wide the prior is.
         self._future: rclpy.Future | None = None
         self._deadline = 0.0
-        self._wider = 1.0
+        self._widening = 1.0
 
     def on_image(self, rgb: np.ndarray, stamp: Time, T_last_camera: np.ndarray) -> None:
         """Take an image (H, W, 3) and the odometry's motion (4, 4) since the last one."""
         grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
         if self.state is State.TRACKING:
             self.T_map_camera = self.T_map_camera @ T_last_camera
-            share = 1.0 if self._last is None else tracked_share(self._last, grey)
-            if share < MIN_TRACKED:
-                self._enter(State.LOST, f"{share:.0%} of the corners found again")
+            ratio = 1.0 if self._last is None else tracked_ratio(self._last, grey)
+            if ratio < MIN_TRACKED_RATIO:
+                self._enter(State.LOST, f"{ratio:.0%} of the corners found again")
         self._last = grey
         if self.state is State.LOST:
             self._ask(rgb, stamp)
 
     @property
     def is_served(self) -> bool:
-        """Whether there is somebody to ask."""
+        """Return whether there is somebody to ask."""
         return self._client.service_is_ready()
 
     @property
     def waits(self) -> bool:
-        """Whether an answer is still to come."""
+        """Return whether an answer is still to come."""
         return self._future is not None
 
     def _ask(self, rgb: np.ndarray, stamp: Time) -> None:
@@ -116,18 +116,18 @@ class SlamStack(Node):
             if time.monotonic() > self._deadline:
                 self._client.remove_pending_request(self._future)
                 self._future = None
-                self._tell("no answer in time")
+                self._note("no answer in time")
             return
         if not self.is_served:
-            self._tell(f"nobody serves {self._client.srv_name}")
+            self._note(f"nobody serves {self._client.srv_name}")
             return
         request = LocalizeImage.Request(
             image=image_message(rgb, stamp), camera_info=calibration(CAMERA), has_prior=True
         )
         request.prior.header = Header(stamp=stamp, frame_id="map")
         set_pose(request.prior, self.T_map_camera)
-        request.prior.pose.covariance = np.diag((self._wider * FIRST_SIGMAS) ** 2).ravel().tolist()
-        self._tell(f"asks with a prior of {100 * self._wider * FIRST_SIGMAS[0]:.0f} cm")
+        request.prior.pose.covariance = np.diag((self._widening * FIRST_SIGMAS) ** 2).ravel().tolist()
+        self._note(f"asks with a prior of {100 * self._widening * FIRST_SIGMAS[0]:.0f} cm")
         self._future, self._deadline = self._client.call_async(request), time.monotonic() + self._timeout
         self._future.add_done_callback(self._on_answer)
 
@@ -135,32 +135,32 @@ class SlamStack(Node):
         self._future = None
         response: LocalizeImage.Response = future.result()
         status = STATUSES[response.status]
-        self._tell(
+        self._note(
             f"{status} after {response.milliseconds:.0f} ms with {response.inliers} inliers: {response.reason}",
             status=status,
         )
         if response.status == LocalizeImage.Response.LOCALIZED:
             sigma = np.sqrt(np.max(np.diag(np.reshape(response.pose.pose.covariance, (6, 6)))))
-            if response.pose.header.frame_id == "map" and sigma <= USABLE_SIGMA:
+            if response.pose.header.frame_id == "map" and sigma <= MAX_SIGMA:
                 self.T_map_camera = pose_of(response.pose)
-                self._wider = 1.0
+                self._widening = 1.0
                 self._enter(State.TRACKING, f"believes it: standard deviations up to {sigma:.4f} (m, rad)")
                 return
-        self._wider = min(2 * self._wider, WIDEST)
+        self._widening = min(2 * self._widening, MAX_WIDENING)
 
     def _enter(self, state: State, why: str) -> None:
         self.state = state
-        self._tell(why)
+        self._note(why)
 
-    def _tell(self, text: str, **values: str) -> None:
+    def _note(self, text: str, **values: str) -> None:
         if self.log and self.log[-1]["text"] == text:
             return
         self.log.append({"state": self.state.value, "text": text} | values)
         print(f"{self.state.value:8}  {text}", flush=True)
 
 
-def tracked_share(last: np.ndarray, grey: np.ndarray) -> float:
-    """Of the corners of one grey image (H, W), the share that is found in the next, and from there again in the one."""
+def tracked_ratio(last: np.ndarray, grey: np.ndarray) -> float:
+    """Return the ratio of corners of a grey image (H, W) that are found in the next, and back from there."""
     corners = cv2.goodFeaturesToTrack(last, 200, 0.01, 10)
     if corners is None:
         return 0.0
@@ -171,6 +171,7 @@ def tracked_share(last: np.ndarray, grey: np.ndarray) -> float:
 
 
 def image_message(rgb: np.ndarray, stamp: Time) -> Image:
+    """Return an image message of pixels (H, W, 3) uint8 RGB."""
     height, width = rgb.shape[:2]
     header = Header(stamp=stamp, frame_id="camera_optical")
     data = array("B", rgb.tobytes())
@@ -178,6 +179,7 @@ def image_message(rgb: np.ndarray, stamp: Time) -> Image:
 
 
 def calibration(camera: Camera) -> CameraInfo:
+    """Return the calibration of a camera."""
     return CameraInfo(
         width=camera.width,
         height=camera.height,
@@ -188,12 +190,14 @@ def calibration(camera: Camera) -> CameraInfo:
 
 
 def set_pose(message: PoseWithCovarianceStamped, pose: np.ndarray) -> None:
+    """Put a pose (4, 4) into a message."""
     position, orientation = message.pose.pose.position, message.pose.pose.orientation
     position.x, position.y, position.z = pose[:3, 3].tolist()
     orientation.x, orientation.y, orientation.z, orientation.w = quaternion_from_matrix(pose[:3, :3]).tolist()
 
 
 def pose_of(message: PoseWithCovarianceStamped) -> np.ndarray:
+    """Return the pose (4, 4) of a message."""
     position, orientation = message.pose.pose.position, message.pose.pose.orientation
     rotation = matrix_from_quaternion([orientation.x, orientation.y, orientation.z, orientation.w])
     return make_pose(rotation, [position.x, position.y, position.z])
@@ -204,11 +208,11 @@ def pose_of(message: PoseWithCovarianceStamped) -> np.ndarray:
 # Images before the camera is covered, and after it was found again; seconds between them, and for which it is carried.
 STEPS = 8
 INTERVAL = 0.05
-CARRIED = 1.2
+CARRIED_SECONDS = 1.2
 # Metres and radians by which the odometry errs from image to image.
-DRIFT_METRES, DRIFT_RADIANS = 0.0005, 0.0005
+DRIFT_SIGMA_METRES, DRIFT_SIGMA_RADIANS = 0.0005, 0.0005
 # So many requests may go without a pose before the stack gives up.
-PATIENCE = 10
+MAX_REQUESTS = 10
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,18 +231,18 @@ class View:
 
 
 def journey(seed: int) -> Iterator[tuple[str, np.ndarray]]:
-    """Phases and true poses T_map_camera (4, 4); the camera stands still while it is covered, and carried off."""
+    """Yield phases and true poses T_map_camera (4, 4); the camera stands still while it is covered, and carried off."""
     walk = Walk(np.random.default_rng(seed).uniform(0, 2 * np.pi, 4))
     for step in range(STEPS):
         yield "walk", walk.pose(step * INTERVAL)
     lost_at = (STEPS - 1) * INTERVAL
     yield "covered", walk.pose(lost_at)
     for step in range(STEPS):
-        yield "carried off" if step == 0 else "walk on", walk.pose(lost_at + CARRIED + step * INTERVAL)
+        yield "carried off" if step == 0 else "walk on", walk.pose(lost_at + CARRIED_SECONDS + step * INTERVAL)
 
 
 def views(seed: int) -> list[View]:
-    """The journey in photos; a covered camera sees noise."""
+    """Return the journey in photos; a covered camera sees noise."""
     rng, room_camera = np.random.default_rng(seed), RoomCamera(Room(seed=0), CAMERA)
     return [
         View(
@@ -253,15 +257,17 @@ def views(seed: int) -> list[View]:
 
 
 def odometry(last: View, view: View, rng: np.random.Generator) -> np.ndarray:
-    """Motion (4, 4) of the camera from one view to the next, as the wheels tell it: they do not notice being lifted."""
+    """Return the motion (4, 4) from one view to the next as wheels measure it: they do not notice being lifted."""
     motion = np.eye(4) if view.phase == "carried off" else invert(last.T_map_camera) @ view.T_map_camera
-    error = make_pose(so3_exp(DRIFT_RADIANS * rng.standard_normal(3)), DRIFT_METRES * rng.standard_normal(3))
+    error = make_pose(
+        so3_exp(DRIFT_SIGMA_RADIANS * rng.standard_normal(3)), DRIFT_SIGMA_METRES * rng.standard_normal(3)
+    )
     return motion @ error
 
 
 def travel(slam: SlamStack, executor: SingleThreadedExecutor, seed: int, timeout: float) -> list[dict]:
-    """Take the stack through the journey; what it thinks at each view, until it gives up."""
-    rng, seen, told = np.random.default_rng(seed), views(seed), []
+    """Take the stack through the journey; return what it thinks at each view, until it gives up."""
+    rng, seen, record = np.random.default_rng(seed), views(seed), []
 
     def spin_until(condition: Callable[[], bool], seconds: float) -> None:
         deadline = time.monotonic() + seconds
@@ -273,18 +279,18 @@ def travel(slam: SlamStack, executor: SingleThreadedExecutor, seed: int, timeout
     for view in seen:
         motion = odometry(last, view, rng)
         # Lost, a robot stops: it sees the same until it has been answered.
-        for _ in range(PATIENCE):
+        for _ in range(MAX_REQUESTS):
             slam.on_image(view.image, slam.get_clock().now().to_msg(), motion)
             spin_until(lambda: not slam.waits, 1.1 * timeout)
             motion = np.eye(4)
             if slam.state is State.TRACKING or view.phase == "covered":
                 break
-        told.append({"phase": view.phase, "state": slam.state.value, "T_map_camera": slam.T_map_camera.tolist()})
+        record.append({"phase": view.phase, "state": slam.state.value, "T_map_camera": slam.T_map_camera.tolist()})
         if slam.state is State.LOST and view.phase != "covered":
             break
         last = view
         spin_until(lambda: False, INTERVAL)
-    return told
+    return record
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -301,9 +307,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     slam = SlamStack(start, args.service, args.timeout)
     executor = SingleThreadedExecutor()
     executor.add_node(slam)
-    told = travel(slam, executor, args.seed, args.timeout)
+    record = travel(slam, executor, args.seed, args.timeout)
     if args.json:
-        args.json.write_text(json.dumps({"log": slam.log, "poses": told}, indent=1))
+        args.json.write_text(json.dumps({"log": slam.log, "poses": record}, indent=1))
     slam.destroy_node()
     rclpy.shutdown()
     return 0 if slam.state is State.TRACKING else 1

@@ -8,11 +8,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import settings
 
 from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.maps.gaussian_map import GaussianMap
 from gsfeatloc_ros.maps.ply import write_ply
 from gsfeatloc_ros.simulate import Room, SimulatedPhoto, cover, simulate_photos
+
+# A slow, shared machine is no reason to fail.
+settings.register_profile("unhurried", deadline=None)
+settings.load_profile("unhurried")
 
 # Nodes of another run on this machine, or of a robot on its network, must not be heard.
 os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)

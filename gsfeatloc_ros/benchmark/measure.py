@@ -44,7 +44,7 @@ def finish(device: str) -> None:
 
 
 def stage_time(device: str) -> tuple[str, Callable[[], float]]:
-    """By which time the stages of work on a device are told, "cpu" or "wall", and the clock for it, in seconds.
+    """Return by which time the stages of work on a device are measured, "cpu" or "wall", and its clock, in seconds.
 
     It is the CPU's where the CPU works; on a GPU the wall time, as CPU time would leave the work out.
     """
@@ -59,7 +59,7 @@ def stage_time(device: str) -> tuple[str, Callable[[], float]]:
 
 
 def spread(milliseconds: Sequence[float]) -> dict[str, float]:
-    """Smallest and median of several measurements of the same."""
+    """Return the smallest and the median of several measurements of the same."""
     return {"min": min(milliseconds), "median": float(np.median(milliseconds))}
 
 
@@ -84,7 +84,7 @@ def memory_taken() -> Iterator[Memory]:
 
 
 def machine() -> dict[str, str | int]:
-    """What the figures were measured on."""
+    """Return what the figures were measured on."""
     models = [line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith("model name")]
     return {
         "cpu": models[0].partition(":")[2].strip() if models else platform.machine(),

@@ -11,7 +11,8 @@ import torch
 from torch.utils.cpp_extension import load_inline
 
 from gsfeatloc_ros.benchmark.frames import UNCOUNTED_FRAMES
-from gsfeatloc_ros.benchmark.measure import spread, timed
+from gsfeatloc_ros.benchmark.measure import Timed, spread, timed
+from gsfeatloc_ros.common.arrays import to_host
 from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.geometry import invert
 from gsfeatloc_ros.maps import GaussianMap
@@ -65,11 +66,14 @@ def measure_against_opensplat(
         raise ValueError("the map was trained antialiased, which OpenSplat cannot draw")
     theirs = _opensplat(checkout, gaussian_map, camera)
     renderer = create_renderer(gaussian_map, "cpu", threads)
-    draw = {"ours": lambda pose: renderer.render(camera, pose).rgb, "opensplat": theirs}
+    draw: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+        "ours": lambda pose: to_host(renderer.render(camera, pose).rgb),
+        "opensplat": theirs,
+    }
     for pose in poses[:UNCOUNTED_FRAMES]:
         for function in draw.values():
             function(pose)
-    frames = {name: [] for name in draw}
+    frames: dict[str, list[Timed[np.ndarray]]] = {name: [] for name in draw}
     for pose in poses:
         for name, function in draw.items():
             frames[name].append(timed(function, pose))
@@ -98,7 +102,7 @@ def print_against_opensplat(report: dict[str, Any]) -> None:
 
 
 def _opensplat(checkout: Path, gaussian_map: GaussianMap, camera: Camera) -> Callable[[np.ndarray], np.ndarray]:
-    """OpenSplat as a function that draws the map from a pose (4, 4) as RGB (H, W, 3) on black."""
+    """Return OpenSplat as a function that draws the map from a pose (4, 4) as RGB (H, W, 3) on black."""
     rasterizer = (checkout / _RASTERIZER).resolve()
     if not rasterizer.is_file():
         raise FileNotFoundError(f"{rasterizer} is missing: is {checkout} a checkout of OpenSplat?")

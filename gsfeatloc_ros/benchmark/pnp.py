@@ -49,7 +49,7 @@ def measure_pnp() -> None:
 
 
 def _matches(count: int, inlier_ratio: float, seed: int) -> tuple[Camera, np.ndarray, np.ndarray, np.ndarray]:
-    """A camera, noisy pixels (N, 2) and points (N, 3) of which a share belongs together, and the true pose."""
+    """Return a camera, noisy pixels (N, 2) and points (N, 3) of which a share belongs together, and the true pose."""
     rng = np.random.default_rng(seed)
     camera = Camera(640, 426, np.array([[660.0, 0, 319.5], [0, 660.0, 212.5], [0, 0, 1]]))
     pixels = rng.uniform([0, 0], [639, 425], (count, 2))

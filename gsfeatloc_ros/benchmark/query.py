@@ -1,24 +1,18 @@
-"""One localization after another, by stage."""
+"""Time of localizations, by stage."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from gsfeatloc_ros.benchmark.measure import spread, stage_time, timed
-from gsfeatloc_ros.common.stage_clock import StageClock
 from gsfeatloc_ros.evaluate.protocol import make_priors, paper_prior_error
-from gsfeatloc_ros.evaluate.scene import load_scene
-from gsfeatloc_ros.localize import localizer as localize
+from gsfeatloc_ros.evaluate.scene import load_scene, load_scene_renderer
+from gsfeatloc_ros.localize.engine import load_matcher
 from gsfeatloc_ros.localize.localizer import Localizer
-from gsfeatloc_ros.maps import load_map
-from gsfeatloc_ros.match import create_matcher
-from gsfeatloc_ros.render import DrawOptions, create_renderer
+from gsfeatloc_ros.localize.settings import MatcherSettings, RendererSettings
 
 
 def measure_queries(scene_path: Path, matcher_name: str, sigma: float, device: str, threads: int) -> dict[str, Any]:
@@ -32,17 +26,17 @@ def measure_queries(scene_path: Path, matcher_name: str, sigma: float, device: s
         ValueError, OSError, RuntimeError: the scene, the matcher or the device cannot be used.
     """
     scene = load_scene(scene_path)
-    renderer = create_renderer(load_map(scene.map_path), device, threads, DrawOptions(scene.background))
-    localizer = Localizer(renderer, create_matcher(matcher_name, device=device))
+    renderer = load_scene_renderer(scene, RendererSettings(device=device, threads=threads))
+    matcher = load_matcher(MatcherSettings(name=matcher_name), renderer.device)
+    clock, now = stage_time(renderer.device)
+    localizer = Localizer(renderer, matcher, now=now)
     error = paper_prior_error(scene, sigma)
     queries = [
         (scene.read_photo(photo), photo.camera, prior, error.covariance)
         for photo, prior in zip(scene.photos, make_priors(scene, error, seed=0), strict=True)
     ]
     localizer.localize(*queries[0])  # what is compiled or loaded at the first call does not count
-    clock, now = stage_time(renderer.device)
-    with _stages_by(now):
-        done = [timed(localizer.localize, *query) for query in queries]
+    done = [timed(localizer.localize, *query) for query in queries]
     stages = {name for query in done for name in query.result.milliseconds} - {"total"}
     by_stage = {name: float(np.median([query.result.milliseconds.get(name, 0.0) for query in done])) for name in stages}
     return {
@@ -51,8 +45,8 @@ def measure_queries(scene_path: Path, matcher_name: str, sigma: float, device: s
         "sigma": sigma,
         "photos": len(done),
         "localized": sum(query.result.localized for query in done),
-        "passes": float(np.mean([query.result.passes for query in done])),
-        "views": float(np.mean([query.result.views for query in done])),
+        "passes": float(np.mean([query.result.evidence.passes for query in done])),
+        "views": float(np.mean([query.result.evidence.views for query in done])),
         "cpu_ms": spread([query.cpu for query in done]),
         "wall_ms": spread([query.wall for query in done]),
         f"stages_{clock}_ms": dict(sorted(by_stage.items(), key=lambda item: -item[1])),
@@ -71,14 +65,3 @@ def print_queries(report: dict[str, Any]) -> None:
     for clock in ("cpu", "wall"):
         for name, milliseconds in report.get(f"stages_{clock}_ms", {}).items():
             print(f"  {name:8} {clock} ms: median {milliseconds:7.1f}")
-
-
-@contextmanager
-def _stages_by(now: Callable[[], float]) -> Iterator[None]:
-    """While this is open, localizers count the time of their stages by another clock."""
-    before = localize.StageClock
-    localize.StageClock = partial(StageClock, now)
-    try:
-        yield
-    finally:
-        localize.StageClock = before

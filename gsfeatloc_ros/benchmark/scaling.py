@@ -1,4 +1,4 @@
-"""How the time of a frame grows with Gaussians, pixels and threads, as a plot."""
+"""Growth of the time of a frame with Gaussians, pixels and threads, as a plot."""
 
 from __future__ import annotations
 
@@ -16,30 +16,30 @@ from gsfeatloc_ros.simulate.two_rooms import VIEWS, two_rooms
 
 COUNTS = (100_000, 200_000, 500_000, 1_000_000, 2_000_000, 5_000_000)
 _SIZES = ((160, 120), (320, 240), (640, 480), (960, 720), (1280, 960))
-# What is kept while another is varied.
-_SIZE, _COUNT = (640, 480), 500_000
+# Kept while another is varied.
+_KEPT_SIZE, _KEPT_COUNT = (640, 480), 500_000
 _FRAMES = 10
 _LABELS = {"gaussians": "Gaussians", "pixels": "pixels", "threads": "threads"}
 _COLORS = {"everything": "tab:blue", "typical": "tab:orange"}
 
 
 def measure_scaling(counts: Sequence[int] = COUNTS) -> list[dict[str, Any]]:
-    """Times of frames of the two rooms on the CPU, with Gaussians (`counts`), pixels and threads varied one at a time.
+    """Time frames of the two rooms on the CPU, with Gaussians (`counts`), pixels and threads varied one at a time.
 
     Returns:
         A row for each value of each of the three, and each view: "varied", "value", "view", "cpu_ms" and "wall_ms".
     """
     cores = len(os.sched_getaffinity(0))
-    base = min(_COUNT, max(counts))
-    rows = list(_rows("threads", base, [(_SIZE, threads, threads) for threads in range(1, cores + 1)]))
+    base = min(_KEPT_COUNT, max(counts))
+    rows = list(_rows("threads", base, [(_KEPT_SIZE, threads, threads) for threads in range(1, cores + 1)]))
     rows += _rows("pixels", base, [(size, cores, size[0] * size[1]) for size in _SIZES])
     for count in counts:
-        rows += _rows("gaussians", count, [(_SIZE, cores, count)])
+        rows += _rows("gaussians", count, [(_KEPT_SIZE, cores, count)])
     return rows
 
 
 def _rows(varied: str, count: int, settings: Iterable[tuple[Size, int, int]]) -> list[dict[str, Any]]:
-    """Rows of `count` Gaussians for each setting: size, threads, and which of all is the value that is varied."""
+    """Measure `count` Gaussians at each setting: size, threads, and the value that is varied; return a row for each."""
     prepared = prepare(two_rooms(count))
     rows = []
     for size, threads, value in settings:
@@ -71,7 +71,9 @@ def draw_scaling(rows: Sequence[dict[str, Any]], path: Path) -> None:
     axes[-1].xaxis.get_major_locator().set_params(integer=True)
     axes[0].set_ylabel("ms per frame, the least of several")
     axes[0].legend()
-    kept = f"two rooms; {_COUNT:,} Gaussians, {_SIZE[0]}x{_SIZE[1]}, all threads where not said otherwise"
+    kept = (
+        f"two rooms; {_KEPT_COUNT:,} Gaussians, {_KEPT_SIZE[0]}x{_KEPT_SIZE[1]}, all threads where not said otherwise"
+    )
     figure.suptitle(f"{kept}\n{machine()['cpu']}, {machine()['cores']} cores")
     figure.savefig(path, dpi=110)
     pyplot.close(figure)

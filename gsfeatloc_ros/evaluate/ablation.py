@@ -1,90 +1,88 @@
-"""What each piece of the localizer brings: it is taken out, and the rest is measured.
+"""Ablation: the localizer without one of its parts, to measure what the part brings.
 
-Passes and the view search are options (`--set max_passes=1`, `--set max_views=0`); the pieces here are none, as nobody
+Passes and the view search are options (`--set max_passes=1`, `--set max_views=0`); the parts here are none, as nobody
 would do without them on a robot.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
-from types import ModuleType
 
 import numpy as np
 
 from gsfeatloc_ros.common.arrays import Array
 from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.photo import Photo
-from gsfeatloc_ros.localize import localizer as localize
+from gsfeatloc_ros.localize.localizer import Localizer
+from gsfeatloc_ros.localize.options import LocalizerOptions
 from gsfeatloc_ros.match import Matcher, Matches, create_tracker
-from gsfeatloc_ros.pose import lift, solve
+from gsfeatloc_ros.pose.lift import LiftOptions
 from gsfeatloc_ros.render.base import Render, Renderer
 
-PIECES = ("tracking", "sub-pixel", "median-depth", "depth-gating", "robust-loss")
+ABLATIONS = ("tracking", "sub-pixel", "median-depth", "depth-gating", "robust-loss")
 
-# Values of a module's limits with which it does nothing.
-_NO_LIMITS: dict[str, tuple[ModuleType, dict[str, float]]] = {
-    "depth-gating": (lift, {"MIN_ALPHA": 0.0, "MAX_DEPTH_STEP": np.inf}),
-    "robust-loss": (solve, {"CAUCHY_SCALE": 1e3}),
-}
+# Lifts every pixel that has a depth.
+_NO_DEPTH_GATING = LiftOptions(min_alpha=0.0, max_depth_step=float("inf"))
+# So wide, in standard deviations, that Cauchy's loss is least squares.
+_NO_ROBUST_LOSS_SCALE = 1e3
 
 
-@contextmanager
-def without(piece: str, matcher: Matcher) -> Iterator[None]:
-    """While this is open, localizers do without `piece`: one of PIECES, or "" for nothing.
+def ablated_localizer(renderer: Renderer, matcher: Matcher, options: LocalizerOptions, ablation: str = "") -> Localizer:
+    """Make a localizer without one of ABLATIONS; "" for the whole one.
 
-    What takes the place of tracking is the matching of features at full size, by `matcher`.
+    Raises:
+        ValueError: an unknown ablation.
     """
-    module, values = _NO_LIMITS.get(piece, (localize, {}))
-    if piece == "tracking":
-        values = {"create_tracker": partial(FeatureTracker, matcher)}
-    if piece == "sub-pixel":
-        values = {"create_tracker": WholePixelTracker}
-    before = {name: getattr(module, name) for name in values}
-    try:
-        for name, value in values.items():
-            setattr(module, name, value)
-        yield
-    finally:
-        for name, value in before.items():
-            setattr(module, name, value)
+    if ablation == "tracking":
+        return Localizer(renderer, matcher, options, create_tracker=partial(FeatureTracker, matcher))
+    if ablation == "sub-pixel":
+        return Localizer(renderer, matcher, options, create_tracker=WholePixelTracker)
+    if ablation == "median-depth":
+        return Localizer(MeanDepthRenderer(renderer), matcher, options)
+    if ablation == "depth-gating":
+        return Localizer(renderer, matcher, replace(options, lift=_NO_DEPTH_GATING))
+    if ablation == "robust-loss":
+        pose = replace(options.pose, cauchy_scale=_NO_ROBUST_LOSS_SCALE)
+        return Localizer(renderer, matcher, replace(options, pose=pose))
+    if ablation:
+        raise ValueError(f"ablation {ablation!r} is not one of {', '.join(ABLATIONS)}")
+    return Localizer(renderer, matcher, options)
 
 
 class FeatureTracker:
-    """Has the place of a tracker of corners, and matches features instead."""
+    """Match features at full size in place of tracking corners."""
 
     def __init__(self, matcher: Matcher, photo: Photo, device: str) -> None:
         self._matcher = matcher
         self.corners = matcher.features(photo.image)
 
     def track(self, image: Array) -> Matches:
-        """Find the photo's features in a render."""
+        """Find the photo's features in a render (H, W, 3) uint8 RGB."""
         return self._matcher.match(self.corners, self._matcher.features(image))
 
 
 class WholePixelTracker:
-    """Without "sub-pixel": where the corners are in the render is rounded."""
+    """Track corners and round where they are in the render to whole pixels."""
 
     def __init__(self, photo: Photo, device: str) -> None:
         self._tracker = create_tracker(photo, device)
         self.corners = self._tracker.corners
 
     def track(self, image: Array) -> Matches:
-        """Find the photo's corners in a render."""
+        """Find the photo's corners in a render (H, W, 3) uint8 RGB."""
         matches = self._tracker.track(image)
         return replace(matches, b=np.round(matches.b))
 
 
 class MeanDepthRenderer:
-    """A renderer that gives the expected depth for the median: without "median-depth"."""
+    """Render with the expected depth in place of the median."""
 
     def __init__(self, renderer: Renderer) -> None:
         self._renderer = renderer
         self.device = renderer.device
 
     def render(self, camera: Camera, T_map_camera: np.ndarray) -> Render:
-        """Render the map."""
+        """Render the map from the pose `T_map_camera` (4, 4)."""
         render = self._renderer.render(camera, T_map_camera)
         return replace(render, median_depth=render.depth)

@@ -8,12 +8,13 @@ name is for testing and the others have made the map.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.geometry import invert, make_pose
-from gsfeatloc_ros.evaluate.dataset import Photo
+from gsfeatloc_ros.evaluate.dataset import PosedPhoto
 from gsfeatloc_ros.evaluate.extras import import_extra
 
 _TEST_EVERY = 8
@@ -29,7 +30,7 @@ _MODELS: dict[str, tuple[tuple[int, int, int, int], str, tuple[int | None, ...]]
 }
 
 
-def load(folder: Path) -> tuple[list[Photo], np.ndarray]:
+def load(folder: Path) -> tuple[list[PosedPhoto], np.ndarray]:
     """Read the test photos and the poses (F, 4, 4) of all photos that COLMAP registered.
 
     Raises:
@@ -51,18 +52,18 @@ def load(folder: Path) -> tuple[list[Photo], np.ndarray]:
         if image.camera_id not in cameras:
             cameras[image.camera_id] = _camera(path, image.camera)
         file = folder / "images" / image.name
-        photos.append(Photo(file.name, file, cameras[image.camera_id], _pose(image)))
+        photos.append(PosedPhoto(file.name, file, cameras[image.camera_id], _pose(image)))
     return photos, np.array([_pose(image) for image in images])
 
 
-def _pose(image: object) -> np.ndarray:
-    """T_map_camera (4, 4) of a pycolmap.Image."""
+def _pose(image: Any) -> np.ndarray:
+    """Return T_map_camera (4, 4) of a pycolmap.Image."""
     T_camera_map = image.cam_from_world().matrix()
     return invert(make_pose(T_camera_map[:, :3], T_camera_map[:, 3]))
 
 
-def _camera(path: Path, camera: object) -> Camera:
-    """The Camera of a pycolmap.Camera."""
+def _camera(path: Path, camera: Any) -> Camera:
+    """Return the Camera of a pycolmap.Camera."""
     name = camera.model.name
     if name not in _MODELS:
         raise ValueError(f"{path}: camera model {name} is not one of {', '.join(_MODELS)}: undistort the images first")

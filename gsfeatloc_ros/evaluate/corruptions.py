@@ -1,7 +1,4 @@
-"""What can be wrong with a photo that is of the scene: bad light, bad optics, things in the way.
-
-Lengths are in pixels of a photo 640 wide.
-"""
+"""Corruptions of photos that are of the scene: bad light, bad optics, things in the way."""
 
 from __future__ import annotations
 
@@ -10,8 +7,14 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 
+# Lengths are in pixels of a photo so wide.
+_REFERENCE_WIDTH = 640
+_DEFOCUS_SIGMA = 2.5
+_MOTION_LENGTH = 15
+
 
 def _expose(gain: float, gamma: float) -> Callable[[np.ndarray], np.ndarray]:
+    """Make the function that multiplies the light and changes its curve."""
     levels = np.clip(gain * (np.arange(256) / 255.0) ** gamma, 0, 1)
     return lambda image: cv2.LUT(image, np.rint(255 * levels).astype(np.uint8))
 
@@ -27,15 +30,15 @@ def _add_noise(image: np.ndarray) -> np.ndarray:
 
 
 def _defocus(image: np.ndarray) -> np.ndarray:
-    return cv2.GaussianBlur(image, (0, 0), 2.5 * image.shape[1] / 640)
+    return cv2.GaussianBlur(image, (0, 0), _DEFOCUS_SIGMA * image.shape[1] / _REFERENCE_WIDTH)
 
 
 def _move(image: np.ndarray) -> np.ndarray:
-    return cv2.blur(image, (max(1, round(15 * image.shape[1] / 640)), 1))
+    return cv2.blur(image, (max(1, round(_MOTION_LENGTH * image.shape[1] / _REFERENCE_WIDTH)), 1))
 
 
 def _cover(share: float) -> Callable[[np.ndarray], np.ndarray]:
-    """Put another piece of the photo, upside down, over a share of it in the middle: like the rest, but wrong."""
+    """Make the function that puts another part of the photo, upside down, over a share of it in the middle."""
 
     def cover(image: np.ndarray) -> np.ndarray:
         height, width = (round(share**0.5 * side) for side in image.shape[:2])
@@ -47,7 +50,7 @@ def _cover(share: float) -> Callable[[np.ndarray], np.ndarray]:
     return cover
 
 
-SPOILERS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+CORRUPTIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "dark": _expose(0.3, 1.5),
     "bright": _expose(1.4, 0.6),
     "shade": _shade,
@@ -58,4 +61,4 @@ SPOILERS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "cover-40": _cover(0.4),
     "cover-60": _cover(0.6),
 }
-"""By name: from a photo (H, W, 3) uint8 RGB to a worse one of the same size."""
+"""By name: functions from a photo (H, W, 3) uint8 RGB to a worse one of the same size."""

@@ -12,11 +12,11 @@ from gsfeatloc_ros.common.camera import Camera
 
 
 @dataclass(frozen=True, eq=False)
-class Photo:
-    """A test photo.
+class PosedPhoto:
+    """A test photo whose pose is known.
 
     Attributes:
-        name: that no other photo of the scene has: the file's, or the path in the scene's folder.
+        name: unique in the scene: the file's, or the path in the scene's folder.
         path: the file.
         camera: that took it.
         T_map_camera: (4, 4) true pose, camera axes as in OpenCV.
@@ -43,7 +43,7 @@ class Scene:
 
     name: str
     map_path: Path
-    photos: tuple[Photo, ...]
+    photos: tuple[PosedPhoto, ...]
     trajectory: np.ndarray
     background: tuple[float, float, float]
 
@@ -52,7 +52,7 @@ class Scene:
         """The camera of the first photo; most scenes have no other."""
         return self.photos[0].camera
 
-    def read_photo(self, photo: Photo) -> np.ndarray:
+    def read_photo(self, photo: PosedPhoto) -> np.ndarray:
         """Read a photo as RGB (H, W, 3) uint8, composited on the background where it has an alpha channel.
 
         Raises:

@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 
 from gsfeatloc_ros.common.camera import Camera
-from gsfeatloc_ros.evaluate.dataset import Photo, read_image
+from gsfeatloc_ros.evaluate.dataset import PosedPhoto, read_image
 from gsfeatloc_ros.evaluate.nerfstudio import frame_pose, naming, read_transforms
 
 
-def load(folder: Path) -> tuple[list[Photo], np.ndarray]:
+def load(folder: Path) -> tuple[list[PosedPhoto], np.ndarray]:
     """Read the test photos and the poses (F, 4, 4) of all frames of the files that are there.
 
     Raises:
@@ -41,5 +41,5 @@ def load(folder: Path) -> tuple[list[Photo], np.ndarray]:
     focal_length = 0.5 * width / math.tan(half_angle)
     K = [[focal_length, 0.0, 0.5 * (width - 1)], [0.0, focal_length, 0.5 * (height - 1)], [0.0, 0.0, 1.0]]
     camera = Camera(width, height, np.array(K))
-    photos = [Photo(image.name, image, camera, pose) for image, pose in frames]
+    photos = [PosedPhoto(image.name, image, camera, pose) for image, pose in frames]
     return photos, np.array(poses + [photo.T_map_camera for photo in photos])

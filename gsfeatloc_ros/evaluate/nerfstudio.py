@@ -14,10 +14,10 @@ from pathlib import Path
 import numpy as np
 
 from gsfeatloc_ros.common.camera import Camera
-from gsfeatloc_ros.evaluate.dataset import Photo
+from gsfeatloc_ros.evaluate.dataset import PosedPhoto
 
 
-def load(folder: Path) -> tuple[list[Photo], np.ndarray]:
+def load(folder: Path) -> tuple[list[PosedPhoto], np.ndarray]:
     """Read the test photos and the poses (F, 4, 4) of all frames.
 
     Raises:
@@ -34,9 +34,8 @@ def load(folder: Path) -> tuple[list[Photo], np.ndarray]:
         unposed = [name for name in names if name not in poses]
         if unposed:
             raise ValueError(f"{len(unposed)} test photos have no frame, the first is {unposed[0]}")
-    return [Photo(Path(name).name, folder / name, camera, poses[name]) for name in names], np.array(
-        list(poses.values())
-    )
+    photos = [PosedPhoto(Path(name).name, folder / name, camera, poses[name]) for name in names]
+    return photos, np.array(list(poses.values()))
 
 
 @contextmanager
@@ -61,7 +60,7 @@ def read_transforms(path: Path) -> dict:
 
 
 def frame_pose(frame: dict) -> np.ndarray:
-    """T_map_camera (4, 4) of a frame, whose own pose has OpenGL's camera axes."""
+    """Return T_map_camera (4, 4) of a frame, whose own pose has OpenGL's camera axes."""
     T_map_opengl = np.array(frame["transform_matrix"], dtype=np.float64)
     if T_map_opengl.shape != (4, 4) or not np.isfinite(T_map_opengl).all():
         raise ValueError(f"transform_matrix of {frame['file_path']} is not a finite 4x4 matrix")

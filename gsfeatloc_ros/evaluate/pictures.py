@@ -9,23 +9,23 @@ import numpy as np
 
 from gsfeatloc_ros.match.base import Matches
 
-_GAP = 6  # pixels between pictures
+_GAP_WIDTH = 6  # pixels between pictures
 _MAX_RINGS = 80  # more hide what they mark
-_RADIUS = 4  # pixels
-_BACKGROUND = 255
+_RING_RADIUS = 4  # pixels
+_GAP_LEVEL = 255
 # Drawn at 1/16 of a pixel, as cv2 counts with `shift=4`.
 _SHIFT = 4
 
 
 def side_by_side(images: Sequence[np.ndarray]) -> np.ndarray:
-    """Images (H, W, 3) uint8 of one height in a row, with a white gap between them."""
-    gap = np.full((images[0].shape[0], _GAP, 3), _BACKGROUND, np.uint8)
+    """Put images (H, W, 3) uint8 of one height in a row, with a white gap between them."""
+    gap = np.full((images[0].shape[0], _GAP_WIDTH, 3), _GAP_LEVEL, np.uint8)
     row = [part for image in images for part in (image, gap)]
     return np.hstack(row[:-1])
 
 
 def mark_matches(photo: np.ndarray, render: np.ndarray, matches: Matches) -> tuple[np.ndarray, np.ndarray]:
-    """The photo and a render (both (H, W, 3) uint8 RGB) with rings round the pixels of matches.
+    """Return the photo and a render, both (H, W, 3) uint8 RGB, with rings round the pixels of matches.
 
     The two ends of a match have the same colour. Of many matches an evenly spread choice is marked, the colours from
     left to right in the photo.
@@ -40,5 +40,5 @@ def mark_matches(photo: np.ndarray, render: np.ndarray, matches: Matches) -> tup
     for picture, pixels in ((photo, chosen.a), (render, chosen.b)):
         for pixel, colour in zip(pixels, colours.tolist(), strict=True):
             centre = np.rint(pixel * (1 << _SHIFT)).astype(int).tolist()
-            cv2.circle(picture, centre, _RADIUS << _SHIFT, colour, 1, cv2.LINE_AA, _SHIFT)
+            cv2.circle(picture, centre, _RING_RADIUS << _SHIFT, colour, 1, cv2.LINE_AA, _SHIFT)
     return photo, render

@@ -52,7 +52,7 @@ def read_priors(path: Path, scene: Scene) -> list[Prior]:
 
 
 def _tum_lines(file: Iterator[str]) -> Iterator[tuple[int, str, list[str]]]:
-    """Number, name and the seven values of each line."""
+    """Yield number, name and the seven values of each line."""
     for number, line in enumerate(file, start=1):
         fields = line.partition("#")[0].split()
         if fields:
@@ -69,7 +69,7 @@ def _csv_lines(file: Iterator[str]) -> Iterator[tuple[int, str, list[str]]]:
 
 
 def _pose(number: int, values: list[str]) -> np.ndarray:
-    """T_map_camera (4, 4) from the fields of a line."""
+    """Return T_map_camera (4, 4) from the fields of a line."""
     try:
         translation, quaternion = np.split(np.array([float(value) for value in values]), [3])
         if quaternion.shape != (4,) or not np.isfinite(translation).all():

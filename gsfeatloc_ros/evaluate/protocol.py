@@ -1,4 +1,4 @@
-"""How the priors of an evaluation are made from the true poses."""
+"""Priors of an evaluation, made from the true poses."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Prior:
 
     Attributes:
         photo: index of the photo in its scene.
-        step: which of the photo's priors this is: the repetition, or the step of a sweep.
+        step: number of the prior among the photo's: the repetition, or the step of a sweep.
         T_map_camera: (4, 4) the pose.
         covariance: (6, 6) of the protocol's errors, as one knows it of a prior in practice: x y z and rotation about
             x y z, axes of the map frame, map units and radians; None if it is not known.
@@ -47,18 +47,18 @@ class PriorError:
 
     @property
     def covariance(self) -> np.ndarray:
-        """Covariance (6, 6) of translation and rotation vector; in whatever axes, as all directions are alike."""
+        """Covariance (6, 6) of translation and rotation vector, the same in all axes as all directions are alike."""
         return np.diag(np.repeat(np.square([self.translation, self.rotation]) / 3, 3))
 
 
 def trajectory_radius(scene: Scene) -> float:
-    """Mean distance of the camera centres of all frames from their centroid, in map units."""
+    """Return the mean distance of the camera centres of all frames from their centroid, in map units."""
     centres = scene.trajectory[:, :3, 3]
     return float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).mean())
 
 
 def paper_bounds(scene: Scene) -> tuple[float, float]:
-    """Largest prior errors of the published evaluation of GSFeatLoc: rotation in radians, translation in map units.
+    """Return the largest prior errors of the published evaluation of GSFeatLoc: radians and map units.
 
     The view of a prior may move by half of the field of view and a quarter more:
     dtheta = FOV_x / 2 + atan(1 / 4), dp = R (tan(FOV_x / 2) + 1 / 4), with R the radius of the trajectory.
@@ -68,7 +68,7 @@ def paper_bounds(scene: Scene) -> tuple[float, float]:
 
 
 def paper_prior_error(scene: Scene, sigma: float) -> PriorError:
-    """Prior error of the published evaluation of GSFeatLoc, scaled by `sigma`: 95 % are within `paper_bounds`."""
+    """Return the published evaluation's prior error, scaled by `sigma`: 95 % are within `paper_bounds`."""
     rotation, translation = paper_bounds(scene)
     return PriorError(sigma * rotation / _QUANTILE_95, sigma * translation / _QUANTILE_95)
 
@@ -93,15 +93,15 @@ def make_priors(scene: Scene, error: PriorError, seed: int) -> list[np.ndarray]:
 
 
 def paper(scene: Scene, sigma: float, seed: int) -> list[Prior]:
-    """The published evaluation of GSFeatLoc: one normally distributed prior a photo, see `paper_prior_error`."""
+    """Draw priors as in the published evaluation of GSFeatLoc: one normally distributed, see `paper_prior_error`."""
     error = paper_prior_error(scene, sigma)
     return [Prior(index, 0, pose, error.covariance) for index, pose in enumerate(make_priors(scene, error, seed))]
 
 
 def chen(scene: Scene, sigma: float, seed: int) -> list[Prior]:
-    """Five priors a photo, moved by 0 to 0.2 radii and turned by 10 to 40 degrees, uniformly, in random directions.
+    """Draw five priors a photo, moved by 0 to 0.2 radii and turned by 10 to 40 degrees, in random directions.
 
-    `sigma` scales the errors.
+    Distances and angles are uniformly distributed; `sigma` scales them.
     """
     radius = trajectory_radius(scene)
     covariance = PriorError(
@@ -119,13 +119,13 @@ def chen(scene: Scene, sigma: float, seed: int) -> list[Prior]:
 
 
 def sweep_rotation(scene: Scene, sigma: float, seed: int) -> list[Prior]:
-    """Every photo panned to the right by 0 to `sigma` times the rotation of `paper_bounds`, in ten steps."""
+    """Pan every photo to the right by 0 to `sigma` times the rotation of `paper_bounds`, in ten steps."""
     angles = _steps(sigma * paper_bounds(scene)[0])
     return _sweep(scene, sigma, [(np.array([0.0, angle, 0.0]), np.zeros(3)) for angle in angles])
 
 
 def sweep_translation(scene: Scene, sigma: float, seed: int) -> list[Prior]:
-    """Every photo moved to the right by 0 to `sigma` times the translation of `paper_bounds`, in ten steps."""
+    """Move every photo to the right by 0 to `sigma` times the translation of `paper_bounds`, in ten steps."""
     distances = _steps(sigma * paper_bounds(scene)[1])
     return _sweep(scene, sigma, [(np.zeros(3), np.array([distance, 0.0, 0.0])) for distance in distances])
 
@@ -144,7 +144,7 @@ def _steps(bound: float) -> np.ndarray:
 
 
 def _sweep(scene: Scene, sigma: float, moves: list[tuple[np.ndarray, np.ndarray]]) -> list[Prior]:
-    """The priors of all photos, each moved by all `moves` (rotation vector, translation)."""
+    """Return the priors of all photos, each moved by all `moves` (rotation vector, translation)."""
     covariance = paper_prior_error(scene, sigma).covariance
     return [
         Prior(index, step, _moved(photo.T_map_camera, *move), covariance)
@@ -154,10 +154,10 @@ def _sweep(scene: Scene, sigma: float, moves: list[tuple[np.ndarray, np.ndarray]
 
 
 def _root_mean_square(low: float, high: float) -> float:
-    """Of a variable uniform between two values."""
+    """Return the root mean square of a variable uniform between two values."""
     return math.sqrt((low * low + low * high + high * high) / 3)
 
 
 def _moved(T_map_camera: np.ndarray, rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
-    """The pose (4, 4) moved by a translation (3,), then turned by a rotation vector (3,), both in its own frame."""
+    """Move a pose (4, 4) by a translation (3,), then turn it by a rotation vector (3,), both in its own frame."""
     return T_map_camera @ make_pose(np.eye(3), translation) @ make_pose(so3_exp(rotation), np.zeros(3))

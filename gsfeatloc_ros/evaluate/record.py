@@ -12,6 +12,7 @@ import os
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import gsfeatloc_ros
 from gsfeatloc_ros.evaluate.dataset import Scene
@@ -19,15 +20,15 @@ from gsfeatloc_ros.evaluate.metrics import QueryResult
 from gsfeatloc_ros.evaluate.protocol import Prior
 from gsfeatloc_ros.evaluate.run import Run
 
-# Parts of the package that no result depends on.
-_NOT_MEASURED = ("benchmark", "node", "replay", "simulate", "tools", "evaluate/report")
+# Rooms of the package that no result depends on.
+_NOT_MEASURED = ("benchmark", "client", "node", "replay", "ros_io", "simulate", "tools", "evaluate/report")
 
 
 @dataclass(frozen=True)
 class Fingerprint:
     """What the results of a run depend on: its settings, and hashes of the rest."""
 
-    settings: dict
+    settings: dict[str, Any]
     code: str
     map: str
     photos: str
@@ -60,17 +61,17 @@ class Record:
         """
         self.path = path
         self.notes: list[str] = []
-        self._fingerprints: dict[str, dict] = {}
+        self._fingerprints: dict[str, dict[str, Any]] = {}
         self._results: dict[str, dict[tuple[str, int], QueryResult]] = {}
         if path and path.exists():
-            self._read()
+            self._read(path)
 
     def __len__(self) -> int:
         """Number of results of all runs."""
         return sum(len(results) for results in self._results.values())
 
     def done(self, fingerprint: Fingerprint) -> dict[tuple[str, int], QueryResult]:
-        """The results that are there of a run, by photo and step; those of its older versions are dropped."""
+        """Return the results that are there of a run, by photo and step; those of its older versions are dropped."""
         current = asdict(fingerprint)
         for identity, other in list(self._fingerprints.items()):
             changed = [part for part in current if current[part] != other[part]]
@@ -91,8 +92,8 @@ class Record:
             with self.path.open("a", encoding="utf-8") as file:
                 file.writelines([*lines, _line(fingerprint.id, result)])
 
-    def _read(self) -> None:
-        text = self.path.read_text(encoding="utf-8", errors="replace")
+    def _read(self, path: Path) -> None:
+        text = path.read_text(encoding="utf-8", errors="replace")
         complete = text.endswith("\n") or not text
         for line in text.splitlines():
             try:
@@ -109,6 +110,8 @@ class Record:
             self._write()
 
     def _write(self) -> None:
+        if self.path is None:
+            return
         lines = []
         for identity, fingerprint in self._fingerprints.items():
             lines.append(_header(identity, fingerprint))
@@ -127,7 +130,7 @@ class SceneHash:
 
 
 def hash_scene(scene: Scene) -> SceneHash:
-    """The hashes of a scene. Of the photos themselves only the sizes are taken.
+    """Return the hashes of a scene. Of the photos themselves only the sizes are taken.
 
     Raises:
         OSError: the map or a photo cannot be read.
@@ -144,7 +147,7 @@ def hash_scene(scene: Scene) -> SceneHash:
 
 
 def fingerprint_of(run: Run, scene: SceneHash, priors: Iterable[Prior]) -> Fingerprint:
-    """The fingerprint of a run in a scene."""
+    """Return the fingerprint of a run in a scene."""
     return Fingerprint(
         settings=run.settings(),
         code=_code(),
@@ -171,7 +174,7 @@ def _digest(parts: Iterable[bytes]) -> str:
     return digest.hexdigest()[:16]
 
 
-def _header(identity: str, fingerprint: dict) -> str:
+def _header(identity: str, fingerprint: dict[str, Any]) -> str:
     return json.dumps({"run": identity, "fingerprint": fingerprint}) + "\n"
 
 

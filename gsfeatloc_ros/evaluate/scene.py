@@ -1,4 +1,4 @@
-"""Finds out what kind of data set a folder is, and loads it."""
+"""Scenes from folders, whatever kind of data set they hold, and the renderers of their maps."""
 
 from __future__ import annotations
 
@@ -7,6 +7,9 @@ from pathlib import Path
 
 from gsfeatloc_ros.evaluate import colmap, nerf_synthetic, nerfstudio
 from gsfeatloc_ros.evaluate.dataset import Scene, read_image
+from gsfeatloc_ros.localize.engine import load_renderer
+from gsfeatloc_ros.localize.settings import MapSettings, RendererSettings
+from gsfeatloc_ros.render import Renderer
 
 # Of each kind, what its folder holds.
 _KINDS = {
@@ -52,6 +55,17 @@ def load_scene(folder: str | Path, map_path: str | Path | None = None) -> Scene:
     )
 
 
+def load_scene_renderer(scene: Scene, renderer: RendererSettings) -> Renderer:
+    """Make the renderer of a scene's map, on the background of its photos.
+
+    The map is read anew: what is measured must not depend on a file that lies beside it.
+
+    Raises:
+        ValueError, OSError, RuntimeError: the settings or the map cannot be used; the message says why.
+    """
+    return load_renderer(MapSettings(path=str(scene.map_path), cache=False), renderer, scene.background)
+
+
 def _find_map(folder: Path) -> Path:
     for pattern in _MAPS:
         found = sorted(folder.glob(pattern), key=_iteration)
@@ -61,6 +75,6 @@ def _find_map(folder: Path) -> Path:
 
 
 def _iteration(path: Path) -> int:
-    """Number at the end of the name of the folder that a map is in, 0 if there is none."""
+    """Return the number at the end of the name of the folder that a map is in, 0 if there is none."""
     number = path.parent.name.rpartition("_")[2]
     return int(number) if number.isdecimal() else 0

@@ -1,12 +1,21 @@
-"""Results of several runs: as JSON, and as the rows of a table."""
+"""Results of several runs: as JSON, and as texts for the terminal."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
-from gsfeatloc_ros.evaluate.metrics import QueryResult, accuracy, best_of, by_step, summarize
+from gsfeatloc_ros.evaluate.metrics import (
+    MAX_ROTATION_ERROR_DEG,
+    MAX_TRANSLATION_ERROR,
+    QueryResult,
+    accuracy,
+    best_of,
+    by_step,
+    summarize,
+)
 from gsfeatloc_ros.evaluate.protocol import SWEEPS
 from gsfeatloc_ros.evaluate.run import Run, Task
 
@@ -18,7 +27,7 @@ _HEADINGS = (
 
 @dataclass(frozen=True)
 class RunResults:
-    """What came out of a run: at least one task, each with its result."""
+    """The tasks of a run, at least one, each with its result."""
 
     run: Run
     tasks: list[Task]
@@ -50,7 +59,7 @@ class Group:
         return [result for member in self.members for result in member.results]
 
     @cached_property
-    def summary(self) -> dict:
+    def summary(self) -> dict[str, Any]:
         """Summary of all results, as for a single run."""
         summary = summarize(self.results)
         per_query = summary.pop("per_query")
@@ -60,8 +69,8 @@ class Group:
             summary["steps"] = by_step(self.results)
         return {**summary, "per_query": per_query}
 
-    def describe(self) -> dict:
-        """Settings and summary, ready for JSON."""
+    def describe(self) -> dict[str, Any]:
+        """Return settings and summary, ready for JSON."""
         run = self.run
         return {
             "scene": run.scene.name,
@@ -71,18 +80,18 @@ class Group:
             "sigma": run.sigma,
             "seed": run.seed if len(self.members) == 1 else self.seeds,
             "options": dict(run.options),
-            "without": run.without,
-            "spoil": run.spoil,
+            "ablation": run.ablation,
+            "corruption": run.corruption,
             **self.summary,
         }
 
     @property
     def label(self) -> str:
-        """Method, matcher, changed options, what was left out and what is wrong with the photos, in short."""
+        """Method, matcher, changed options, ablation and corruption in short."""
         run = self.run
         words = [run.method, run.matcher, *(f"{name}={value:g}" for name, value in run.options)]
-        words += [f"without {run.without}"] if run.without else []
-        words += [f"{run.spoil} photos"] if run.spoil else []
+        words += [f"without {run.ablation}"] if run.ablation else []
+        words += [f"{run.corruption} photos"] if run.corruption else []
         return " ".join(words)
 
 
@@ -94,8 +103,8 @@ def over_seeds(runs: Sequence[RunResults]) -> list[Group]:
     return [Group(members) for members in groups.values()]
 
 
-def describe(runs: Sequence[RunResults]) -> dict:
-    """All results, ready for JSON: of a single run as it is, of several as `runs` and, over their seeds, `pooled`."""
+def describe(runs: Sequence[RunResults]) -> dict[str, Any]:
+    """Return all results, ready for JSON: of one run as it is, of several as `runs` and, over their seeds, `pooled`."""
     if len(runs) == 1:
         return Group([runs[0]]).describe()
     pooled = [group.describe() for group in over_seeds(runs)]
@@ -105,14 +114,14 @@ def describe(runs: Sequence[RunResults]) -> dict:
 
 
 def query_table(results: Sequence[QueryResult]) -> str:
-    """A table for the terminal with one line a query."""
+    """Return a table with one line a query."""
     width = max(len(result.photo) for result in results)
     lines = [f"{'photo':{width}}     prior error      final error   matches  inliers     ms"]
     for result in results:
         line = (
             f"{result.photo:{width}}  {result.prior_rotation_error_deg:5.1f} deg {result.prior_translation_error:5.3f}"
             f"  {result.rotation_error_deg:6.3f} deg {result.translation_error:6.4f}"
-            f"  {result.matches:7}  {result.inliers:7}  {result.milliseconds:5.0f}"
+            f"  {result.evidence['matches']:7}  {result.evidence['inliers']:7}  {result.milliseconds:5.0f}"
         )
         if not result.answered:
             line += f"  NOT ANSWERED: {result.reason}"
@@ -123,7 +132,7 @@ def query_table(results: Sequence[QueryResult]) -> str:
 
 
 def run_table(groups: Sequence[Group]) -> str:
-    """A table for the terminal with one line a group."""
+    """Return a table with one line a group."""
     rows = [_HEADINGS]
     for group in groups:
         run, summary = group.run, group.summary
@@ -148,3 +157,37 @@ def run_table(groups: Sequence[Group]) -> str:
         )
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return "\n".join("  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)) for row in rows)
+
+
+def run_summary(report: dict[str, Any]) -> str:
+    """Return what came out of a single run, described by `describe`, in lines."""
+    rotation, translation, time = (report[key] for key in ("rotation_error_deg", "translation_error", "milliseconds"))
+    lines = [
+        f"\n{report['scene']}, protocol {report['protocol']} (sigma {report['sigma']:g}, seed {report['seed']}), "
+        f"method {report['method']}, matcher {report['matcher']}",
+        f"  success            {100 * report['success_rate']:.1f} % of {report['queries']} "
+        f"(< {MAX_ROTATION_ERROR_DEG:g} deg and < {MAX_TRANSLATION_ERROR:g} of the trajectory's radius)",
+        f"  answered           {report['answered']}, of which wrong {report['wrong_answers']}",
+        f"  rotation error     median {rotation['median']:.3f} deg, mean {rotation['mean']:.3f} deg",
+        f"  translation error  median {translation['median']:.4f}, mean {translation['mean']:.4f} (over the radius)",
+    ]
+    if report["coverage"]:
+        held = ", ".join(f"{100 * share:.0f} % in the {percent} %" for percent, share in report["coverage"].items())
+        lines.append(
+            f"  covariance         NEES {report['nees_mean']:.2f} a degree of freedom (median "
+            f"{report['nees_median']:.2f}); of the truths {held} ellipsoid"
+        )
+    if "best_of_priors" in report:
+        best = report["best_of_priors"]
+        lines.append(
+            f"  best of the priors success {100 * best['success_rate']:.1f} % of {best['queries']} photos, median "
+            f"{best['rotation_error_deg']['median']:.3f} deg, {best['translation_error']['median']:.4f}"
+        )
+    for step in report.get("steps", []):
+        lines.append(
+            f"  prior off by       {step['prior_rotation_error_deg']:5.1f} deg, {step['prior_translation_error']:.3f}: "
+            f"success {100 * step['success_rate']:5.1f} %, wrong {step['wrong_answers']}"
+        )
+    lines.append(f"  time per photo     median {time['median']:.0f} ms, 95 % within {time['p95']:.0f} ms")
+    lines.append("  (a photo that was not answered has the errors of its prior)")
+    return "\n".join(lines)

@@ -24,7 +24,7 @@ _MAGICS = (
     (b"PK\x03\x04", read_sog),
     (b"PK\x05\x06", read_sog),  # an empty one
 )
-_HEAD_BYTES = 64
+_MAX_HEAD_BYTES = 64
 
 
 def load_map(path: str | Path, alignment: Similarity | None = None) -> GaussianMap:
@@ -54,7 +54,7 @@ def _reader(path: Path) -> Callable[[Path], GaussianMap]:
     if path.exists() and not path.is_file():  # opening a pipe would wait for its writer
         raise MapError(f"{path}: is not a file")
     with path.open("rb") as stream:
-        head = stream.read(_HEAD_BYTES)
+        head = stream.read(_MAX_HEAD_BYTES)
     if not head:
         raise MapError(f"{path}: is an empty file")
     if head.startswith(b"{") and head.isascii() and b"\0" not in head:

@@ -13,13 +13,13 @@ from gsfeatloc_ros.maps.gaussian_map import GaussianMap, MapError
 # Constant harmonic of the sphere: colour = 0.5 + SH_C0 * its coefficient.
 SH_C0 = 0.28209479177387814
 # Gaussians taken apart at once: a block of them stays in the CPU's cache. A multiple of compressed .ply's chunk.
-BLOCK = 4096
+MAX_BLOCK_ROWS = 4096
 # Of SH degree 3 these take 11.8 GB.
 MAX_GAUSSIANS = 50_000_000
 # An .spz of SH degree 3 takes no more for each.
 MAX_PACKED_BYTES = 65 * MAX_GAUSSIANS
 # Packed Gaussians compress to a half or a third. What claims to unpack to so many times its size is no map.
-MAX_COMPRESSION = 100
+MAX_COMPRESSION_RATIO = 100
 
 
 class Block(NamedTuple):
@@ -42,7 +42,7 @@ def check_count(path: Path, count: int) -> None:
 
 def check_compression(path: Path, packed_size: int, file_size: int) -> None:
     """Refuse a claim of `packed_size` bytes compressed into a file of `file_size`, before memory is taken for them."""
-    if packed_size > MAX_COMPRESSION * file_size:
+    if packed_size > MAX_COMPRESSION_RATIO * file_size:
         raise MapError(f"{path}: is damaged: it claims {packed_size} bytes of Gaussians compressed to {file_size}")
 
 
@@ -55,9 +55,9 @@ def read_packed(path: Path, file: Path, limit: int = MAX_PACKED_BYTES) -> bytes:
 
 
 def block_slices(count: int) -> Iterator[slice]:
-    """Yield slices of at most BLOCK rows that cover `count` rows."""
-    for start in range(0, count, BLOCK):
-        yield slice(start, min(start + BLOCK, count))
+    """Yield slices of at most MAX_BLOCK_ROWS rows that cover `count` rows."""
+    for start in range(0, count, MAX_BLOCK_ROWS):
+        yield slice(start, min(start + MAX_BLOCK_ROWS, count))
 
 
 def assemble(

@@ -52,7 +52,7 @@ class PlyFile:
         return [*self._header.comments, *(comment for element in self._header for comment in element.comments)]
 
     def blocks(self, name: str) -> Iterator[np.ndarray]:
-        """Yield the rows of element `name`, which has no lists, as structured arrays (n,) of at most BLOCK rows."""
+        """Yield the rows of element `name`, which has no lists: structured arrays (n,) of at most MAX_BLOCK_ROWS."""
         element = self._header[name]
         before = self._header.elements[: self._header.elements.index(element)]
         read = self._read_ascii if self._header.text else self._read_binary

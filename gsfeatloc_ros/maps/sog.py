@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 
 from gsfeatloc_ros.maps.assemble import (
-    MAX_COMPRESSION,
+    MAX_COMPRESSION_RATIO,
     MAX_PACKED_BYTES,
     Block,
     assemble,
@@ -101,7 +101,7 @@ def _read_member(path: Path, archive: zipfile.ZipFile, name: str, limit: int = M
     member = archive.getinfo(name)
     if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         raise MapError(f"{path}: {name} is compressed in a way that a .sog is not: zip it with deflate or without")
-    if member.file_size > min(limit, MAX_COMPRESSION * member.compress_size):
+    if member.file_size > min(limit, MAX_COMPRESSION_RATIO * member.compress_size):
         size = f"{member.file_size} bytes of {member.compress_size}"
         raise MapError(f"{path}: is damaged: {name} claims {size}, which is too many for a .sog")
     return archive.read(member)

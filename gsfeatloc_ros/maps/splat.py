@@ -15,7 +15,7 @@ from gsfeatloc_ros.maps.gaussian_map import GaussianMap, MapError
 
 _ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("rotation", "u1", 4)])
 
-_TEXT_BYTES = 1024
+_MAX_TEXT_BYTES = 1024
 
 
 def read_splat(path: Path) -> GaussianMap:
@@ -34,7 +34,7 @@ def read_splat(path: Path) -> GaussianMap:
         )
     with path.open("rb") as stream:
         # Any bytes could be Gaussians, but without a zero, an opaque one and a negative number they are a text.
-        start = stream.read(_TEXT_BYTES)
+        start = stream.read(_MAX_TEXT_BYTES)
         if start.isascii() and b"\0" not in start:
             raise MapError(f"{path}: is none of .ply, .spz, .sog and .splat: it looks like a text")
     check_count(path, count)

@@ -12,7 +12,7 @@ from gsfeatloc_ros.match.nearest import match_mutual
 # Renders are smoother than photos: SIFT's usual threshold of 0.04 leaves too few features in them.
 MIN_CONTRAST = 0.01
 # Of Lowe's test: distance to the nearest descriptor over that to the second nearest.
-MAX_RATIO = 0.85
+MAX_DISTANCE_RATIO = 0.85
 
 
 class Sift:
@@ -38,4 +38,4 @@ class Sift:
 
     def match(self, a: Features, b: Features) -> Matches:
         """Match the features of two images."""
-        return match_mutual(a, b, max_ratio=MAX_RATIO)
+        return match_mutual(a, b, max_ratio=MAX_DISTANCE_RATIO)

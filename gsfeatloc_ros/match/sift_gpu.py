@@ -19,7 +19,7 @@ from torch.nn import functional
 from gsfeatloc_ros.common.arrays import Array, to_device
 from gsfeatloc_ros.match.base import Features, Matches
 from gsfeatloc_ros.match.nearest import match_mutual
-from gsfeatloc_ros.match.sift import MAX_RATIO, MIN_CONTRAST
+from gsfeatloc_ros.match.sift import MAX_DISTANCE_RATIO, MIN_CONTRAST
 from gsfeatloc_ros.match.tensor import LUMA
 
 # Scale space: the image, enlarged twofold, has the first blur; every octave begins at the second and doubles it in so
@@ -192,7 +192,7 @@ class GpuSift:
 
     def match(self, a: Features, b: Features) -> Matches:
         """Match the features of two images."""
-        return match_mutual(a, b, max_ratio=MAX_RATIO)
+        return match_mutual(a, b, max_ratio=MAX_DISTANCE_RATIO)
 
     def _none(self) -> Features:
         return Features(
@@ -386,6 +386,6 @@ def _cells() -> tuple[np.ndarray, np.ndarray]:
     count = int(2 * reach * _CELL_SAMPLES)
     line = (np.arange(count) + 0.5) / _CELL_SAMPLES - reach
     centers = np.arange(_CELLS) - (_CELLS - 1) / 2
-    share = np.maximum(1 - np.abs(line[:, None] - centers), 0) * np.exp(-0.5 * (line[:, None] / (_CELLS / 2)) ** 2)
+    along_axis = np.maximum(1 - np.abs(line[:, None] - centers), 0) * np.exp(-0.5 * (line[:, None] / (_CELLS / 2)) ** 2)
     offsets = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
-    return _CELL_SIZE * offsets, np.kron(share, share)
+    return _CELL_SIZE * offsets, np.kron(along_axis, along_axis)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from threading import Lock
 
 import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
@@ -57,6 +58,8 @@ class Publishers:
         self._odom_frame = settings.node.odom_frame if settings.node.publish_tf else ""
         self._tolerance = Duration(nanoseconds=int(1e9 * settings.node.transform_tolerance))
         self._T_map_odom: np.ndarray | None = None
+        # An answer and the timer broadcast in threads of their own; stamps must not go back.
+        self._broadcast_lock = Lock()
         # Of the image last answered, in nanoseconds.
         self.last_stamp: int | None = None
         if self._odom_frame and not settings.map.aligned:
@@ -147,7 +150,8 @@ class Publishers:
         self._T_map_odom = None
 
     def _broadcast(self) -> None:
-        T_map_odom = self._T_map_odom
-        if T_map_odom is not None:
-            stamp = (self._node.get_clock().now() + self._tolerance).to_msg()
-            self._transforms.broadcast(self._map_frame, self._odom_frame, T_map_odom, stamp)
+        with self._broadcast_lock:
+            T_map_odom = self._T_map_odom
+            if T_map_odom is not None:
+                stamp = (self._node.get_clock().now() + self._tolerance).to_msg()
+                self._transforms.broadcast(self._map_frame, self._odom_frame, T_map_odom, stamp)

@@ -1,4 +1,4 @@
-"""Figures of the parts that decide how fast and how right an answer is.
+"""Measure the parts that decide how fast and how right an answer is.
 
     python -m gsfeatloc_ros.tools.benchmark synthetic --gaussians 1000000 --out map.ply
     python -m gsfeatloc_ros.tools.benchmark render --map map.ply --size 640x480 --json frames.json
@@ -34,6 +34,7 @@ from gsfeatloc_ros.maps.ply import write_ply
 from gsfeatloc_ros.match import DEFAULT_MATCHER, MATCHERS
 from gsfeatloc_ros.render import DEVICES
 from gsfeatloc_ros.simulate.two_rooms import VIEWS, two_rooms
+from gsfeatloc_ros.tools.options import add_old_name
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -104,9 +105,13 @@ def _parser() -> argparse.ArgumentParser:
 
     scaling = commands.add_parser("scaling", parents=[file], help="ms against Gaussians, pixels and threads, as a plot")
     scaling.add_argument("--out", type=Path, required=True, metavar="FILE.png", help="the plot")
-    scaling.add_argument(
-        "--most", type=int, default=COUNTS[-1], help="of Gaussians; 5 million take 6 GB (default: %(default)s)"
+    max_gaussians = scaling.add_argument(
+        "--max-gaussians",
+        type=int,
+        default=COUNTS[-1],
+        help="of the largest map; 5 million take 6 GB (default: %(default)s)",
     )
+    add_old_name(scaling, max_gaussians, "--most")
     scaling.set_defaults(run=_scaling)
 
     commands.add_parser("pnp", help="PoseLib against OpenCV's USAC on simulated matches").set_defaults(
@@ -169,9 +174,9 @@ def _synthetic(options: argparse.Namespace) -> None:
 
 
 def _scaling(options: argparse.Namespace) -> None:
-    counts = [count for count in COUNTS if count <= options.most]
+    counts = [count for count in COUNTS if count <= options.max_gaussians]
     if not counts:
-        raise ValueError(f"--most must be at least {COUNTS[0]}")
+        raise ValueError(f"--max-gaussians must be at least {COUNTS[0]}")
     rows = measure_scaling(counts)
     draw_scaling(rows, options.out)
     _write(options.json, {"rows": rows})
@@ -183,7 +188,7 @@ def _write(path: Path | None, report: dict[str, Any]) -> None:
 
 
 def _pose(numbers: list[float]) -> np.ndarray:
-    return make_pose(matrix_from_quaternion(numbers[3:]), numbers[:3])
+    return make_pose(matrix_from_quaternion(np.array(numbers[3:])), np.array(numbers[:3]))
 
 
 def _size(text: str) -> tuple[int, int]:

@@ -1,4 +1,4 @@
-"""Localizes the test photos of scenes from wrong priors and says how well.
+"""Localize the test photos of scenes from wrong priors, and say how well.
 
     python -m gsfeatloc_ros.tools.evaluate SCENE --method default --matcher xfeat --json result.json
     python -m gsfeatloc_ros.tools.evaluate SCENE... --method default,published --matcher sift,xfeat --seed 0-9 \\
@@ -12,26 +12,23 @@ not answered has the errors of its prior.
 from __future__ import annotations
 
 import argparse
-import itertools
 import json
 import shlex
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection
 from pathlib import Path
 
 from tqdm import tqdm
 
-from gsfeatloc_ros.evaluate.ablation import PIECES
-from gsfeatloc_ros.evaluate.corruptions import SPOILERS
-from gsfeatloc_ros.evaluate.metrics import MAX_ROTATION_ERROR_DEG, MAX_TRANSLATION_ERROR, QueryResult
+from gsfeatloc_ros.evaluate.ablation import ABLATIONS
+from gsfeatloc_ros.evaluate.corruptions import CORRUPTIONS
+from gsfeatloc_ros.evaluate.plan import Combinations, Evaluation
 from gsfeatloc_ros.evaluate.protocol import PROTOCOLS
-from gsfeatloc_ros.evaluate.record import Fingerprint, Record, fingerprint_of, hash_scene
-from gsfeatloc_ros.evaluate.run import METHODS, PRIORS_FILE, Run, Task, draw_priors, localize_all
-from gsfeatloc_ros.evaluate.scene import load_scene
-from gsfeatloc_ros.evaluate.tables import RunResults, describe, over_seeds, query_table, run_table
+from gsfeatloc_ros.evaluate.record import Record
+from gsfeatloc_ros.evaluate.run import METHODS, PRIORS_FILE
+from gsfeatloc_ros.evaluate.tables import RunResults, describe, over_seeds, query_table, run_summary, run_table
 from gsfeatloc_ros.match import DEFAULT_MATCHER, MATCHERS
-from gsfeatloc_ros.tools.options import Settings, localizer_options, number, setting
+from gsfeatloc_ros.tools.options import Settings, add_old_name, localizer_options, number, setting
 
 _NOTHING = "nothing"
 
@@ -62,140 +59,55 @@ def main(arguments: list[str] | None = None) -> int:
     return 0
 
 
-@dataclass
-class _Plan:
-    """A run with its tasks, and the results that are there of them."""
-
-    run: Run
-    fingerprint: Fingerprint
-    tasks: list[Task]
-    found: dict[tuple[str, int], QueryResult]
-
-
 def _evaluate(options: argparse.Namespace) -> list[RunResults]:
     """Do all runs, but for what the record has already, and print what came out."""
     record = Record(_record_path(options))
-    kept = len(record)
-    plans = {plan.run: plan for plan in _plans(options, record)}
-    to_do = [task for plan in plans.values() for task in plan.tasks if _query(task) not in plan.found]
-    queries = sum(len(plan.tasks) for plan in plans.values())
+    evaluation = Evaluation(_combinations(options).runs(), options.limit, record)
+    done = evaluation.queries - len(evaluation.to_do)
     for note in record.notes:
         print(f"evaluate: {note}")
-    if kept:
-        print(f"evaluate: {record.path}: has {queries - len(to_do)} of the {queries} results already")
-
-    with tqdm(total=queries, initial=queries - len(to_do), unit="photo") as progress:
-        for task, result in localize_all(to_do, options.jobs):
-            plan = plans[task.run]
-            plan.found[_query(task)] = result
-            record.append(plan.fingerprint, result)
+    if evaluation.recorded:
+        print(f"evaluate: {record.path}: has {done} of the {evaluation.queries} results already")
+    with tqdm(total=evaluation.queries, initial=done, unit="photo") as progress:
+        for task in evaluation.localize(options.jobs):
             progress.set_description(f"{task.run.scene.name} {task.run.method} {task.run.matcher}", refresh=False)
             progress.update()
-    results = [
-        RunResults(plan.run, plan.tasks, [plan.found[_query(task)] for task in plan.tasks]) for plan in plans.values()
-    ]
+    results = evaluation.results()
     if len(results) == 1:
         print(query_table(results[0].results))
-        print(_summary(describe(results)))
+        print(run_summary(describe(results)))
     else:
         print(run_table(over_seeds(results)))
     return results
 
 
-def _plans(options: argparse.Namespace, record: Record) -> Iterator[_Plan]:
-    """The tasks of all runs, and what the record has of them."""
-    for (folder, map_path), runs in itertools.groupby(_runs(options), key=lambda run: (run.scene, run.map_path)):
-        scene = load_scene(folder, map_path)
-        scene_hash = hash_scene(scene)
-        limit = options.limit or len(scene.photos)
-        for run in runs:
-            priors = draw_priors(run, scene)
-            fingerprint = fingerprint_of(run, scene_hash, priors)
-            tasks = [
-                Task(run, fingerprint.version, scene.photos[prior.photo].name, prior)
-                for prior in priors
-                if prior.photo < limit
-            ]
-            if not tasks:
-                raise ValueError(f"{run.priors_file}: has no prior of the first {limit} photos")
-            yield _Plan(run, fingerprint, tasks, record.done(fingerprint))
-
-
-def _query(task: Task) -> tuple[str, int]:
-    """What tells a task from the others of its run."""
-    return task.photo, task.prior.step
-
-
 def _record_path(options: argparse.Namespace) -> Path | None:
-    """Where the results are kept, each as soon as it is there."""
+    """Return where the results are kept, each as soon as it is there."""
     if options.report:
         options.report.mkdir(parents=True, exist_ok=True)
         return options.report / "results.jsonl"
     return options.json and options.json.with_suffix(".jsonl")
 
 
-def _runs(options: argparse.Namespace) -> list[Run]:
-    """All combinations of the options, those next to each other that need the same map and matcher."""
+def _combinations(options: argparse.Namespace) -> Combinations:
+    """Return the settings that the options name."""
     maps = options.map or [None] * len(options.scene)
-    sets = [[(name, value) for value in values] for name, values in options.set.items()]
-    return [
-        Run(
-            scene=scene.resolve(),
-            map_path=map_path and map_path.resolve(),
-            protocol=protocol,
-            priors_file=options.priors.resolve() if protocol == PRIORS_FILE else None,
-            method=method,
-            matcher=matcher,
-            sigma=sigma,
-            seed=seed,
-            max_width=options.max_width,
-            options=changed,
-            without=without.replace(_NOTHING, ""),
-            spoil=spoil.replace(_NOTHING, ""),
-        )
-        for scene, map_path in zip(options.scene, maps, strict=True)
-        for matcher, method, protocol, sigma, seed in itertools.product(
-            options.matcher, options.method, options.protocol, options.sigma, options.seed
-        )
-        # The published recipe has no options and is taken whole.
-        for changed in (itertools.product(*sets) if method == "default" else [()])
-        for without in (options.without if method == "default" else [_NOTHING])
-        for spoil in options.spoil
-    ]
-
-
-def _summary(report: dict) -> str:
-    """What came out of a single run, for the terminal."""
-    rotation, translation, time = (report[key] for key in ("rotation_error_deg", "translation_error", "milliseconds"))
-    lines = [
-        f"\n{report['scene']}, protocol {report['protocol']} (sigma {report['sigma']:g}, seed {report['seed']}), "
-        f"method {report['method']}, matcher {report['matcher']}",
-        f"  success            {100 * report['success_rate']:.1f} % of {report['queries']} "
-        f"(< {MAX_ROTATION_ERROR_DEG:g} deg and < {MAX_TRANSLATION_ERROR:g} of the trajectory's radius)",
-        f"  answered           {report['answered']}, of which wrong {report['wrong_answers']}",
-        f"  rotation error     median {rotation['median']:.3f} deg, mean {rotation['mean']:.3f} deg",
-        f"  translation error  median {translation['median']:.4f}, mean {translation['mean']:.4f} (over the radius)",
-    ]
-    if report["coverage"]:
-        held = ", ".join(f"{100 * share:.0f} % in the {percent} %" for percent, share in report["coverage"].items())
-        lines.append(
-            f"  covariance         NEES {report['nees_mean']:.2f} a degree of freedom (median "
-            f"{report['nees_median']:.2f}); of the truths {held} ellipsoid"
-        )
-    if "best_of_priors" in report:
-        best = report["best_of_priors"]
-        lines.append(
-            f"  best of the priors success {100 * best['success_rate']:.1f} % of {best['queries']} photos, median "
-            f"{best['rotation_error_deg']['median']:.3f} deg, {best['translation_error']['median']:.4f}"
-        )
-    for step in report.get("steps", []):
-        lines.append(
-            f"  prior off by       {step['prior_rotation_error_deg']:5.1f} deg, {step['prior_translation_error']:.3f}: "
-            f"success {100 * step['success_rate']:5.1f} %, wrong {step['wrong_answers']}"
-        )
-    lines.append(f"  time per photo     median {time['median']:.0f} ms, 95 % within {time['p95']:.0f} ms")
-    lines.append("  (a photo that was not answered has the errors of its prior)")
-    return "\n".join(lines)
+    return Combinations(
+        scenes=[
+            (scene.resolve(), map_path and map_path.resolve())
+            for scene, map_path in zip(options.scene, maps, strict=True)
+        ],
+        protocols=options.protocol,
+        priors_file=options.priors and options.priors.resolve(),
+        methods=options.method,
+        matchers=options.matcher,
+        sigmas=options.sigma,
+        seeds=options.seed,
+        max_width=options.max_width,
+        options=options.set,
+        ablations=[name.replace(_NOTHING, "") for name in options.ablation],
+        corruptions=[name.replace(_NOTHING, "") for name in options.corruption],
+    )
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -247,20 +159,22 @@ def _parser() -> argparse.ArgumentParser:
         metavar="OPTION=LIST",
         help=f"change an option of method default: {', '.join(localizer_options())}",
     )
-    parser.add_argument(
-        "--without",
-        type=_names((_NOTHING, *PIECES)),
+    ablation = parser.add_argument(
+        "--ablation",
+        type=_names((_NOTHING, *ABLATIONS)),
         default=[_NOTHING],
         metavar="LIST",
-        help=f"take a piece out of method default, one at a time: {', '.join(PIECES)} (default: {_NOTHING})",
+        help=f"take a part out of method default, one at a time: {', '.join(ABLATIONS)} (default: {_NOTHING})",
     )
-    parser.add_argument(
-        "--spoil",
-        type=_names((_NOTHING, *SPOILERS)),
+    add_old_name(parser, ablation, "--without")
+    corruption = parser.add_argument(
+        "--corruption",
+        type=_names((_NOTHING, *CORRUPTIONS)),
         default=[_NOTHING],
         metavar="LIST",
-        help=f"make something wrong with the photos, one at a time: {', '.join(SPOILERS)} (default: {_NOTHING})",
+        help=f"make the photos worse, one way at a time: {', '.join(CORRUPTIONS)} (default: {_NOTHING})",
     )
+    add_old_name(parser, corruption, "--spoil")
     parser.add_argument("--limit", type=number(int, 0), default=0, help="only the first photos; 0 for all")
     parser.add_argument(
         "--max-width", type=number(int, 1), default=640, help="resize wider photos (default: %(default)s)"
@@ -282,7 +196,9 @@ def _check(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None
         parser.error(f"--priors and --protocol {PRIORS_FILE} need each other")
 
 
-def _names(known: Sequence[str]) -> Callable[[str], list[str]]:
+def _names(known: Collection[str]) -> Callable[[str], list[str]]:
+    """Make the parser of names separated by commas, each one of `known`."""
+
     def parse(text: str) -> list[str]:
         names = text.split(",")
         unknown = [name for name in names if name not in known]
@@ -294,7 +210,7 @@ def _names(known: Sequence[str]) -> Callable[[str], list[str]]:
 
 
 def _list(parse: Callable[[str], float]) -> Callable[[str], list[float]]:
-    """Parse numbers separated by commas, and ranges of whole numbers as 0-9."""
+    """Make the parser of numbers separated by commas, and of ranges of whole numbers as 0-9."""
 
     def parse_list(text: str) -> list[float]:
         values: list[float] = []

@@ -4,27 +4,44 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Callable
-from dataclasses import fields
+import sys
+from collections.abc import Callable, Sequence
+from typing import Any
 
-from gsfeatloc_ros.localize.localizer import LocalizerOptions
+from gsfeatloc_ros.common.parameter import parameters_of
+from gsfeatloc_ros.localize.options import LocalizerOptions
+
+# Have options of the commands of their own.
+_OWN_OPTIONS = ("max_image_width", "seed")
+# New names of localizer options by their old ones, which work until the next release.
+_RENAMED = {"min_agreement": "min_correlation"}
 
 
 class Settings(argparse.Action):
-    """Collects pairs of a name and a value in a dictionary."""
+    """Collect pairs of a name and a value in a dictionary."""
 
-    def __call__(self, parser: object, namespace: argparse.Namespace, values: tuple, option: object = None) -> None:
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: str | Sequence[Any] | None,
+        option_string: str | None = None,
+    ) -> None:
+        """Add a pair."""
+        assert isinstance(values, tuple)
         setattr(namespace, self.dest, getattr(namespace, self.dest) | dict([values]))
 
 
 def localizer_options() -> dict[str, type]:
-    """Names and types of the LocalizerOptions that OPTION=VALUE changes."""
-    own = ("max_image_width", "seed")  # have options of the commands of their own
-    kinds = {field.name: type(field.default) for field in fields(LocalizerOptions) if field.name not in own}
-    return {name: kind for name, kind in kinds.items() if kind in (int, float)}
+    """Return names and types of the parameters of LocalizerOptions that OPTION=VALUE changes."""
+    return {
+        parameter.name: type(parameter.default)
+        for parameter in parameters_of(LocalizerOptions)
+        if parameter.name not in _OWN_OPTIONS
+    }
 
 
-def setting(parse: Callable[[Callable[[str], float]], Callable]) -> Callable[[str], tuple]:
+def setting(parse: Callable[[Callable[[str], float]], Callable[[str], Any]]) -> Callable[[str], tuple[str, Any]]:
     """Make the parser of OPTION=VALUE, for a name of localizer_options.
 
     Args:
@@ -32,8 +49,11 @@ def setting(parse: Callable[[Callable[[str], float]], Callable]) -> Callable[[st
     """
     kinds = localizer_options()
 
-    def parse_setting(text: str) -> tuple:
+    def parse_setting(text: str) -> tuple[str, Any]:
         name, equals, value = text.partition("=")
+        if equals and name in _RENAMED:
+            _warn_of_old_name(f"option {name}", _RENAMED[name])
+            name = _RENAMED[name]
         if not equals or name not in kinds:
             raise argparse.ArgumentTypeError(f"{text} is not OPTION=VALUE with an option out of {', '.join(kinds)}")
         return name, parse(number(kinds[name], -math.inf))(value)
@@ -54,3 +74,37 @@ def number(kind: Callable[[str], float], minimum: float) -> Callable[[str], floa
         return value
 
     return parse
+
+
+def add_old_name(parser: argparse.ArgumentParser, option: argparse.Action, old: str) -> None:
+    """Let an option that takes one value have its old name as well, with a notice; --help does not show it.
+
+    Args:
+        parser: that has the option.
+        option: what parser.add_argument returned.
+        old: the old name, e.g. "--most".
+    """
+
+    class OldName(argparse.Action):
+        def __call__(
+            self,
+            parser: argparse.ArgumentParser,
+            namespace: argparse.Namespace,
+            values: str | Sequence[Any] | None,
+            option_string: str | None = None,
+        ) -> None:
+            _warn_of_old_name(old, option.option_strings[0])
+            setattr(namespace, self.dest, values)
+
+    parser.add_argument(
+        old,
+        action=OldName,
+        dest=option.dest,
+        type=option.type or str,
+        default=argparse.SUPPRESS,
+        help=argparse.SUPPRESS,
+    )
+
+
+def _warn_of_old_name(old: str, new: str) -> None:
+    print(f"{old} is now {new}; the old name works until the next release", file=sys.stderr)

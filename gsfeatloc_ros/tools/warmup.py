@@ -11,8 +11,10 @@ import sys
 import time
 
 from gsfeatloc_ros.common.kernel_cache import kernel_cache_folder
+from gsfeatloc_ros.localize.engine import load_matcher
 from gsfeatloc_ros.localize.first_run import warm_up
-from gsfeatloc_ros.match import MATCHERS, create_matcher
+from gsfeatloc_ros.localize.settings import MatcherSettings
+from gsfeatloc_ros.match import MATCHERS
 from gsfeatloc_ros.render import DEVICES
 
 
@@ -25,7 +27,9 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     start = time.perf_counter()
     try:
-        matcher = create_matcher(options.matcher, options.weights, device=options.device) if options.matcher else None
+        matcher = None
+        if options.matcher:
+            matcher = load_matcher(MatcherSettings(options.matcher, options.weights), options.device)
         loaded = time.perf_counter()
         done = warm_up(matcher, options.device)
     except (ValueError, RuntimeError, OSError) as error:
@@ -33,7 +37,7 @@ def main(arguments: list[str] | None = None) -> int:
         return 1
     compiled = f"{done.compiled} functions compiled" if done.compiled else "all in the cache"
     print(f"kernels: {compiled}, {done.kernels_seconds:.1f} s; kept in {kernel_cache_folder()}")
-    if matcher is not None:
+    if done.estimate is not None:
         print(f"matcher {options.matcher}: ready in {loaded - start:.1f} s")
         seconds, estimate = done.localization_seconds, done.estimate
         print(f"a localization in a made-up map: {estimate.status.value} in {seconds:.1f} s: {estimate.reason}")

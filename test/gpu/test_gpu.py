@@ -228,10 +228,10 @@ def test_a_render_is_made_and_stays_on_the_gpu(gpu) -> None:
     renderer = GpuRenderer(gaussian_map, device=gpu.device)
     gpu.reset()
     render = renderer.render(small_camera(), POSE)
-    assert not gpu.to_host
+    assert not gpu.to_host, gpu.explain()
     # Where the camera is goes there, and nobody waits.
-    assert not gpu.waits
-    assert 0 < sum(gpu.to_device) < 200
+    assert not gpu.waits, gpu.explain()
+    assert 0 < sum(gpu.to_device) < 200, gpu.explain()
     assert_same(render.on_host(), CpuRenderer(gaussian_map).render(small_camera(), POSE), 70)
 
 
@@ -244,7 +244,7 @@ def test_a_picture_drawn_small_is_enlarged_on_the_gpu(gpu) -> None:
     pictures = {name: getattr(render, name) for name in ("rgb", "depth", "median_depth", "depth_std", "alpha")}
     for name, picture in pictures.items():
         assert (picture.device.type, picture.dtype) == (gpu.device, torch.float32), name
-    assert (gpu.to_host, gpu.waits) == ([], [])
+    assert (gpu.to_host, gpu.waits) == ([], []), gpu.explain()
     assert_same(render.on_host(), CpuRenderer(gaussian_map, options=half).render(small_camera(), POSE), 70)
 
 

@@ -1,4 +1,4 @@
-"""A whole query on a GPU: the same answers as on the CPU, and no picture leaves the device before the pose is solved.
+"""A whole query on a GPU: the same answers as on the CPU, and no picture leaves the device before the pose is verified.
 
 The GPU is a simulated one (stand_in/gpu.py).
 """
@@ -6,6 +6,7 @@ The GPU is a simulated one (stand_in/gpu.py).
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import takewhile
 
 import numpy as np
 import pytest
@@ -55,40 +56,33 @@ def test_finds_the_camera_as_on_the_cpu(gpu, renderer, room_map, room_camera, ro
     on_gpu = Localizer(renderer, MATCHERS[name].create("", 2048, gpu.device))
     on_cpu = Localizer(CpuRenderer(room_map), create_matcher(name, device="cpu"))
     for photo in room_photos[:3]:
-        there, here = (
-            localizer.localize(photo.image, room_camera, photo.T_map_camera_prior) for localizer in (on_gpu, on_cpu)
+        trace, here = (
+            on_gpu.trace(photo.image, room_camera, photo.T_map_camera_prior),
+            on_cpu.localize(photo.image, room_camera, photo.T_map_camera_prior),
         )
+        there = trace.estimate
         assert there.status is here.status is Status.LOCALIZED
         assert rotation_error_deg(there.T_map_camera, here.T_map_camera) < 0.1
         assert translation_error(there.T_map_camera, here.T_map_camera) < 0.005
-        assert there.inliers == pytest.approx(here.inliers, rel=0.1)
-        np.testing.assert_array_equal(there.last_render.image().shape, photo.image.shape)
+        assert there.evidence.inliers == pytest.approx(here.evidence.inliers, rel=0.1)
+        assert trace.render is not None
+        np.testing.assert_array_equal(trace.render.image().shape, photo.image.shape)
 
 
 @pytest.mark.parametrize("name", ["sift", "xfeat", "aliked-lightglue", "disk-lightglue"])
-def test_no_picture_leaves_the_gpu_before_the_pose_is_solved(
-    gpu, renderer, room_camera, room_photos, name, monkeypatch
-) -> None:
+def test_no_picture_leaves_the_gpu_before_the_pose_is_verified(gpu, renderer, room_camera, room_photos, name) -> None:
     localizer = Localizer(renderer, MATCHERS[name].create("", 2048, gpu.device))
-    left = []
-    judge = localizer._judge
-
-    def note_what_left_until_now(*arguments):
-        left.extend(gpu.to_host)
-        return judge(*arguments)
-
-    monkeypatch.setattr(localizer, "_judge", note_what_left_until_now)
     photo = room_photos[0]
     image = photo.image.copy()
     image.flags.writeable = False  # as those of messages
     gpu.reset()
     estimate = localizer.localize(image, room_camera, photo.T_map_camera_prior)
     assert estimate.status is Status.LOCALIZED
-    assert 0 < max(left) <= SMALL
+    # Verification compares pictures, on the host.
+    assert max(gpu.to_host) > SMALL, gpu.explain()
+    before = list(takewhile(lambda size: size <= SMALL, gpu.to_host))
     # The photo's corners; of the render at the prior and of those at estimates, matches and the depths under them.
-    assert sum(size > 100 for size in left) == 1 + 2 * (1 + estimate.passes)
-    # The judge compares pictures, on the host.
-    assert max(gpu.to_host) > SMALL
+    assert sum(size > 100 for size in before) == 1 + 2 * (1 + estimate.evidence.passes), gpu.explain()
 
 
 def test_a_matcher_on_the_cpu_takes_renders_of_a_gpu(gpu, renderer, room_camera, room_photos) -> None:

@@ -150,10 +150,10 @@ def test_pictures_on_the_device_stay_there_until_the_matches() -> None:
         on_device = torch.from_numpy(moved).to(gpu.device)
         gpu.reset()
         b = sift.features(on_device)
-        assert (gpu.to_host, gpu.to_device, gpu.waits) == ([], [], ["nonzero"])
-        assert len(gpu.operations) < 260
+        assert (gpu.to_host, gpu.to_device, gpu.waits) == ([], [], ["nonzero"]), gpu.explain()
+        assert len(gpu.operations) < 260, gpu.explain()
         gpu.reset()
         matches = sift.match(a, b)
-        assert len(gpu.to_host) == len(gpu.waits) == 1
+        assert len(gpu.to_host) == len(gpu.waits) == 1, gpu.explain()
     np.testing.assert_array_equal(matches.a, wanted.a)
     np.testing.assert_array_equal(matches.b, wanted.b)

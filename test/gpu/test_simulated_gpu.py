@@ -183,7 +183,7 @@ def test_there_is_none_outside() -> None:
     ],
 )
 def test_operations(gpu, x, act, operations) -> None:
-    assert noted(gpu, lambda: act(x)) == (operations, [], [], [])
+    assert noted(gpu, lambda: act(x)) == (operations, [], [], []), gpu.explain()
 
 
 @pytest.mark.parametrize(
@@ -201,7 +201,7 @@ def test_operations(gpu, x, act, operations) -> None:
 )
 def test_copies_to_the_host_wait(gpu, x, copy_back, size) -> None:
     operations, to_host, to_device, waits = noted(gpu, lambda: copy_back(x))
-    assert (to_host, to_device, len(waits)) == ([size], [], 1)
+    assert (to_host, to_device, len(waits)) == ([size], [], 1), gpu.explain()
     assert "copy" not in "".join(operations)
 
 
@@ -218,7 +218,7 @@ def test_copies_to_the_host_wait(gpu, x, copy_back, size) -> None:
 )
 def test_copies_to_the_device_wait_if_told_to(gpu, x, send, size, waits) -> None:
     operations, to_host, to_device, waited = noted(gpu, lambda: send(x))
-    assert (operations, to_host, to_device, len(waited)) == ([], [], [size], waits)
+    assert (operations, to_host, to_device, len(waited)) == ([], [], [size], waits), gpu.explain()
 
 
 @pytest.mark.parametrize(
@@ -242,7 +242,7 @@ def test_copies_to_the_device_wait_if_told_to(gpu, x, send, size, waits) -> None
     ],
 )
 def test_what_needs_a_number_from_the_device_waits(gpu, x, act, waits) -> None:
-    assert noted(gpu, lambda: act(x))[1:] == ([], [], waits)
+    assert noted(gpu, lambda: act(x))[1:] == ([], [], waits), gpu.explain()
 
 
 def test_kernels_of_others_take_the_devices_tensors(gpu, x) -> None:
@@ -321,8 +321,8 @@ def test_depth_bins(gpu) -> None:
     on_device = [tensor.to(gpu.device) for tensor in (depths, areas, weights)]
     gpu.reset()
     found = statistics(*on_device)
-    assert (gpu.to_host, gpu.to_device, gpu.waits) == ([], [], [])
-    assert 0 < len(gpu.operations) < 10 * BINS
+    assert (gpu.to_host, gpu.to_device, gpu.waits) == ([], [], []), gpu.explain()
+    assert 0 < len(gpu.operations) < 10 * BINS, gpu.explain()
     assert torch.equal(found.cpu(), wanted)
 
 
@@ -355,7 +355,8 @@ def test_learned_matchers(monkeypatch, create) -> None:
         images = [torch.from_numpy(image).to(gpu.device) for image in images]
         gpu.reset()
         a, b = (on_gpu.features(image) for image in images)
-        assert max(gpu.to_host, default=0) <= 8  # no picture leaves the device
+        # No picture leaves the device.
+        assert max(gpu.to_host, default=0) <= 8, gpu.explain()
         matches = on_gpu.match(a, b)
     assert len(wanted) > 20
     for array in ("a", "b", "scores"):

@@ -150,12 +150,12 @@ def test_on_a_gpu_all_stays_there_but_what_is_found() -> None:
         render = torch.from_numpy(other).to(gpu.device)
         gpu.reset()
         tracker = GpuCornerTracker(photo_of(image), gpu.device)
-        assert len(gpu.to_host) == 1
+        assert len(gpu.to_host) == 1, gpu.explain()
         gpu.reset()
         matches = tracker.track(render)
-        assert len(gpu.waits) == len(gpu.to_host) == 1
-        assert not gpu.to_device
-        assert len(gpu.operations) < 700
+        assert len(gpu.waits) == len(gpu.to_host) == 1, gpu.explain()
+        assert not gpu.to_device, gpu.explain()
+        assert len(gpu.operations) < 700, gpu.explain()
         np.testing.assert_allclose(matches.a, expected.a)
         np.testing.assert_allclose(matches.b, expected.b, atol=1e-4)
         np.testing.assert_array_equal(matches.scores, 1.0)

@@ -1,5 +1,6 @@
 """Priors, the published recipe and the measures."""
 
+import inspect
 import json
 from dataclasses import asdict, fields, replace
 from pathlib import Path
@@ -20,11 +21,13 @@ from gsfeatloc_ros.common.geometry import (
     so3_log,
     translation_error,
 )
-from gsfeatloc_ros.evaluate.ablation import PIECES, MeanDepthRenderer, without
-from gsfeatloc_ros.evaluate.corruptions import SPOILERS
-from gsfeatloc_ros.evaluate.dataset import Photo, Scene
+from gsfeatloc_ros.common.stage_clock import Interrupted
+from gsfeatloc_ros.evaluate.ablation import ABLATIONS, ablated_localizer
+from gsfeatloc_ros.evaluate.corruptions import CORRUPTIONS
+from gsfeatloc_ros.evaluate.dataset import PosedPhoto, Scene
 from gsfeatloc_ros.evaluate.metrics import (
     QueryResult,
+    Scoring,
     best_of,
     by_step,
     chi_square_cdf,
@@ -35,6 +38,7 @@ from gsfeatloc_ros.evaluate.metrics import (
 from gsfeatloc_ros.evaluate.priors_file import read_priors
 from gsfeatloc_ros.evaluate.protocol import (
     PROTOCOLS,
+    Prior,
     PriorError,
     make_priors,
     paper_bounds,
@@ -43,11 +47,11 @@ from gsfeatloc_ros.evaluate.protocol import (
     trajectory_radius,
 )
 from gsfeatloc_ros.evaluate.published import PublishedLocalizer
-from gsfeatloc_ros.localize import localizer as localize
 from gsfeatloc_ros.localize.estimate import Estimate, Status
-from gsfeatloc_ros.localize.localizer import Localizer, LocalizerOptions
+from gsfeatloc_ros.localize.evidence import Evidence, Limits
+from gsfeatloc_ros.localize.localizer import Localizer
+from gsfeatloc_ros.localize.options import LocalizerOptions
 from gsfeatloc_ros.match import Features, Matches, create_matcher
-from gsfeatloc_ros.pose import lift, solve
 from gsfeatloc_ros.render import Render, create_renderer
 
 CAMERA = Camera(320, 240, np.array([[300.0, 0, 160], [0, 300.0, 120], [0, 0, 1]]))
@@ -59,7 +63,7 @@ def scene():
     """Three photos on a circle of radius 2 that looks about, and a fourth pose on it."""
     angles = [0.0, 1.0, 2.0, 3.0]
     poses = [make_pose(so3_exp(np.array([0.2, a, 0.1 * a])), 2 * np.array([np.cos(a), 0, np.sin(a)])) for a in angles]
-    photos = tuple(Photo(f"{i}.5.png", Path(f"{i}.5.png"), CAMERA, pose) for i, pose in enumerate(poses[:3]))
+    photos = tuple(PosedPhoto(f"{i}.5.png", Path(f"{i}.5.png"), CAMERA, pose) for i, pose in enumerate(poses[:3]))
     return Scene("circle", Path("map.ply"), photos, np.array(poses), (0.0, 0.0, 0.0))
 
 
@@ -179,7 +183,7 @@ def test_protocols_give_poses(scene_of_one, protocol, seed, sigma):
 
 @pytest.fixture(scope="module")
 def scene_of_one():
-    photos = (Photo("a.png", Path("a.png"), CAMERA, PRIOR),)
+    photos = (PosedPhoto("a.png", Path("a.png"), CAMERA, PRIOR),)
     return Scene("one", Path("map.ply"), photos, np.array([PRIOR, np.eye(4)]), (0.0, 0.0, 0.0))
 
 
@@ -299,7 +303,7 @@ def test_published_recipe_cuts_keypoints_to_whole_pixels():
     assert estimate.localized
     assert rotation_error_deg(estimate.T_map_camera, expected) < 1e-3
     assert translation_error(estimate.T_map_camera, expected) < 1e-4
-    assert estimate.inliers == estimate.matches == len(a)
+    assert estimate.evidence.inliers == estimate.evidence.matches == len(a)
 
 
 @pytest.mark.parametrize("count", [0, 3])
@@ -317,7 +321,8 @@ def test_published_recipe_without_depth_has_no_pose():
     localizer = PublishedLocalizer(GivenDepth(np.full_like(depth, np.nan)), GivenMatches(a, b))
     estimate = localizer.localize(np.zeros((240, 320, 3), np.uint8), CAMERA, PRIOR)
     assert not estimate.localized
-    assert estimate.matches == len(a)
+    assert estimate.evidence.matches == len(a)
+    assert estimate.evidence.lifted == 0
 
 
 def test_published_recipe_with_matches_of_nothing_has_no_pose():
@@ -325,7 +330,36 @@ def test_published_recipe_with_matches_of_nothing_has_no_pose():
     _, b, depth = shifted_pixels(rng, 30)
     localizer = PublishedLocalizer(GivenDepth(depth), GivenMatches(rng.uniform(0, 240, (30, 2)), b))
     estimate = localizer.localize(np.zeros((240, 320, 3), np.uint8), CAMERA, PRIOR)
-    assert not estimate.localized or estimate.inliers < 10
+    assert not estimate.localized or estimate.evidence.inliers < 10
+
+
+@pytest.mark.parametrize("method", ["localize", "trace"])
+def test_published_recipe_has_the_interface_of_the_localizer(method):
+    ours, theirs = (
+        [(each.name, each.kind, each.annotation, each.default is each.empty) for each in signature.parameters.values()]
+        for signature in (inspect.signature(getattr(cls, method)) for cls in (Localizer, PublishedLocalizer))
+    )
+    assert theirs == ours
+
+
+def test_published_recipe_traces_what_it_localizes():
+    a, b, depth = shifted_pixels(np.random.default_rng(0))
+    localizer = PublishedLocalizer(GivenDepth(depth), GivenMatches(a, b), max_image_width=160)
+    image = np.random.default_rng(1).integers(0, 256, (240, 320, 3), np.uint8)
+    trace = localizer.trace(image, CAMERA, PRIOR, np.eye(6))
+    estimate = localizer.localize(image, CAMERA, PRIOR)
+    np.testing.assert_array_equal(trace.estimate.T_map_camera, estimate.T_map_camera)
+    assert trace.photo.image.shape == (120, 160, 3)
+    assert trace.photo.camera.width == 160
+    assert trace.render is None
+    assert len(trace.correspondences) == 0
+
+
+def test_published_recipe_is_given_up_on_request():
+    a, b, depth = shifted_pixels(np.random.default_rng(0))
+    localizer = PublishedLocalizer(GivenDepth(depth), GivenMatches(a, b))
+    with pytest.raises(Interrupted):
+        localizer.localize(np.zeros((240, 320, 3), np.uint8), CAMERA, PRIOR, interrupted=lambda: True)
 
 
 # Measures
@@ -336,17 +370,21 @@ def moved(degrees, distance):
 
 
 def answer(degrees, distance, covariance=None):
-    return Estimate(Status.LOCALIZED, "found", moved(degrees, distance), covariance, matches=30, inliers=20, passes=2)
+    evidence = Evidence(matches=30, inliers=20, passes=2)
+    return Estimate(Status.LOCALIZED, "found", moved(degrees, distance), covariance, evidence)
 
 
-FAILED = Estimate(Status.FAILED, "3 matches", matches=3)
-REJECTED = Estimate(Status.REJECTED, "no agreement", matches=50, inliers=9, passes=2, reprojection_error=1.5)
+FAILED = Estimate(Status.FAILED, "3 matches", evidence=Evidence(matches=3))
+REJECTED = Estimate(
+    Status.REJECTED, "no agreement", evidence=Evidence(matches=50, inliers=9, passes=2, reprojection_error_px=1.5)
+)
+PHOTO = PosedPhoto("a.png", Path("a.png"), CAMERA, np.eye(4))
 
 
 def result(estimate, prior=None, prior_is_answer=False, milliseconds=10.0):
     """Measured against a camera at the origin, in a trajectory of radius 2."""
     prior = moved(20.0, 1.0) if prior is None else prior
-    return measure("a.png", estimate, np.eye(4), prior, 2.0, milliseconds, prior_is_answer)
+    return measure(PHOTO, Prior(0, 3, prior), estimate, milliseconds, Scoring(2.0, prior_is_answer))
 
 
 def test_errors_of_an_answer():
@@ -355,6 +393,7 @@ def test_errors_of_an_answer():
     assert (r.prior_rotation_error_deg, r.prior_translation_error) == pytest.approx((20.0, 0.5))
     assert r.answered
     assert r.success
+    assert (r.photo, r.step, r.milliseconds) == ("a.png", 3, 10.0)
 
 
 @pytest.mark.parametrize(
@@ -381,8 +420,8 @@ def test_the_publication_answers_with_the_prior():
 def test_a_rejected_estimate_is_no_answer():
     r = result(REJECTED)
     assert (r.status, r.answered, r.success, r.verdict) == ("rejected", False, False, "none")
-    assert (r.matches, r.inliers, r.passes) == (50, 9, 2)
-    assert r.evidence["reprojection_error"] == 1.5
+    assert (r.evidence["matches"], r.evidence["inliers"], r.evidence["passes"]) == (50, 9, 2)
+    assert r.evidence["reprojection_error_px"] == 1.5
 
 
 def test_what_an_estimate_carries_is_kept_and_ready_for_json():
@@ -390,10 +429,10 @@ def test_what_an_estimate_carries_is_kept_and_ready_for_json():
     r = result(estimate)
     assert r.status == "localized"
     assert r.stage_milliseconds == {"render": 3.0, "total": 7.0}
-    # Every number of an Estimate is there, and what is not a number by its absence.
-    numbers = {field.name for field in fields(Estimate) if field.type in ("int", "float")}
-    assert set(r.evidence) == numbers - {"matches", "inliers", "passes"}
-    assert r.evidence["reprojection_error"] is None
+    # Every number of the evidence is there, under its name and once, and what could not be measured is None.
+    assert list(r.evidence) == [field.name for field in fields(Evidence)]
+    assert not set(r.evidence) & {field.name for field in fields(QueryResult)}
+    assert (r.evidence["inliers"], r.evidence["reprojection_error_px"]) == (20, None)
     assert r.nees is None
     assert r.in_ellipsoid is None
     assert QueryResult(**json.loads(json.dumps(asdict(r), allow_nan=False))) == r
@@ -486,53 +525,44 @@ def test_success_by_step():
 # Ablation
 
 
-def pieces_in_place():
-    return (lift.MIN_ALPHA, lift.MAX_DEPTH_STEP, solve.CAUCHY_SCALE, localize.create_tracker)
-
-
-@pytest.mark.parametrize("piece", ["", *PIECES])
-def test_a_piece_is_back_afterwards(piece):
-    whole = pieces_in_place()
-    with without(piece, matcher=None):
-        assert (pieces_in_place() == whole) == (piece in ("", "median-depth"))
-    assert pieces_in_place() == whole
-    with pytest.raises(KeyError), without(piece, matcher=None):
-        raise KeyError
-    assert pieces_in_place() == whole
-
-
-@pytest.mark.parametrize("piece", PIECES)
-def test_every_piece_makes_a_difference(piece, room_map, room_camera, room_photos):
+@pytest.mark.parametrize("ablation", ABLATIONS)
+def test_every_ablation_makes_a_difference(ablation, room_map, room_camera, room_photos):
     photo, matcher = room_photos[0], create_matcher("sift")
     renderer = create_renderer(room_map)
-    options = LocalizerOptions(min_inlier_ratio=0.3, max_passes=1)
+    options = LocalizerOptions(limits=Limits(min_inlier_ratio=0.3), max_passes=1)
 
     def answer(taken_out):
-        used = MeanDepthRenderer(renderer) if taken_out == "median-depth" else renderer
-        with without(taken_out, matcher):
-            return Localizer(used, matcher, options).localize(photo.image, room_camera, photo.T_map_camera_prior)
+        localizer = ablated_localizer(renderer, matcher, options, taken_out)
+        return localizer.localize(photo.image, room_camera, photo.T_map_camera_prior)
 
-    whole, part = answer(""), answer(piece)
+    whole, part = answer(""), answer(ablation)
     assert whole.localized
     assert part.localized, part.reason
     assert not np.array_equal(whole.T_map_camera, part.T_map_camera)
     assert translation_error(part.T_map_camera, photo.T_map_camera) < 0.05
+    # Nothing is left behind: the next localizer is the whole one again.
+    np.testing.assert_array_equal(answer("").T_map_camera, whole.T_map_camera)
 
 
-# Spoilt photos
+def test_an_ablation_that_is_not_known():
+    with pytest.raises(ValueError, match="ablation 'renderer' is not one of tracking, sub-pixel"):
+        ablated_localizer(GivenDepth(np.ones((240, 320))), GivenMatches([], []), LocalizerOptions(), "renderer")
 
 
-@pytest.mark.parametrize("name", SPOILERS)
-def test_spoilt_photos_are_of_the_same_size_and_worse(name, room_photos):
+# Corruptions
+
+
+@pytest.mark.parametrize("name", CORRUPTIONS)
+def test_corrupted_photos_are_of_the_same_size_and_worse(name, room_photos):
     image = room_photos[0].image
     kept = image.copy()
-    spoilt = SPOILERS[name](image)
+    corrupted = CORRUPTIONS[name](image)
     np.testing.assert_array_equal(image, kept)
-    assert spoilt.shape == image.shape
-    assert spoilt.dtype == np.uint8
-    changed = (spoilt != image).any(axis=2).mean()
+    assert corrupted.shape == image.shape
+    assert corrupted.dtype == np.uint8
+    changed = (corrupted != image).any(axis=2).mean()
     if name.startswith("cover"):
         assert changed == pytest.approx(int(name[-2:]) / 100, abs=0.02)
     else:
         assert changed > 0.5
-    np.testing.assert_array_equal(SPOILERS[name](image), spoilt)
+    np.testing.assert_array_equal(CORRUPTIONS[name](image), corrupted)

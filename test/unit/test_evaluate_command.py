@@ -1,7 +1,7 @@
 """The command: what it writes and prints, several processes, and going on where it was interrupted."""
 
 import json
-from dataclasses import asdict, fields
+from dataclasses import asdict
 
 import joblib
 import numpy as np
@@ -9,10 +9,11 @@ import pytest
 from room_datasets import write_nerfstudio
 
 from gsfeatloc_ros.common.geometry import quaternion_from_matrix
+from gsfeatloc_ros.common.parameter import parameters_of
 from gsfeatloc_ros.evaluate.record import fingerprint_of, hash_scene
 from gsfeatloc_ros.evaluate.run import Run, draw_priors
 from gsfeatloc_ros.evaluate.scene import load_scene
-from gsfeatloc_ros.localize.localizer import LocalizerOptions
+from gsfeatloc_ros.localize.options import LocalizerOptions
 from gsfeatloc_ros.maps import load_map
 from gsfeatloc_ros.maps.ply import write_ply
 from gsfeatloc_ros.simulate import simulate_photos
@@ -45,6 +46,7 @@ def without_times(report):
     ]
 
 
+@pytest.mark.slow
 def test_several_of_everything_in_one_call(room_scene, tmp_path, capsys):
     path = tmp_path / "all.json"
     lists = ["--method", "default,published", "--seed", "3-4", "--protocol", "paper,chen", "--limit", "1"]
@@ -75,6 +77,7 @@ def test_several_of_everything_in_one_call(room_scene, tmp_path, capsys):
     assert all(line.startswith("room") for line in table[1:])
 
 
+@pytest.mark.slow
 def test_sweep_is_reported_by_step(room_scene, tmp_path, capsys):
     path = tmp_path / "sweep.json"
     assert main([str(room_scene), *QUICK, "--protocol", "sweep-rotation", "--limit", "1", "--json", str(path)]) == 0
@@ -112,12 +115,14 @@ def test_options_of_the_localizer_are_changed(room_scene, tmp_path):
     assert [run["answered"] for run in runs[:2]] == [1, 0]
 
 
-def test_pieces_are_left_out_and_photos_spoilt_one_at_a_time(room_scene, tmp_path):
+@pytest.mark.slow
+@pytest.mark.parametrize(("ablation", "corruption"), [("--ablation", "--corruption"), ("--without", "--spoil")])
+def test_parts_are_taken_out_and_photos_corrupted_one_at_a_time(room_scene, tmp_path, capsys, ablation, corruption):
     path = tmp_path / "worse.json"
-    lists = ["--without", "nothing,sub-pixel", "--spoil", "nothing,dark", "--limit", "1"]
+    lists = [ablation, "nothing,sub-pixel", corruption, "nothing,dark", "--limit", "1"]
     assert main([str(room_scene), *QUICK, "--method", "default,published", *lists, "--json", str(path)]) == 0
     runs = read(path)["runs"]
-    assert [(run["method"], run["without"], run["spoil"]) for run in runs] == [
+    assert [(run["method"], run["ablation"], run["corruption"]) for run in runs] == [
         ("default", "", ""),
         ("default", "", "dark"),
         ("default", "sub-pixel", ""),
@@ -127,8 +132,21 @@ def test_pieces_are_left_out_and_photos_spoilt_one_at_a_time(room_scene, tmp_pat
     ]
     errors = [run["per_query"][0]["rotation_error_deg"] for run in runs]
     assert len(set(errors)) == len(errors)
+    said = capsys.readouterr().err
+    # The old names work with a notice.
+    for old, new in (("--without", "--ablation"), ("--spoil", "--corruption")):
+        assert (f"{old} is now {new}; the old name works until the next release" in said) == (ablation == "--without")
 
 
+def test_the_old_name_of_a_localizer_option_works_with_a_notice(room_scene, tmp_path, capsys):
+    path = tmp_path / "report.json"
+    assert main([str(room_scene), *QUICK, "--set", "min_agreement=1.0", "--limit", "1", "--json", str(path)]) == 0
+    assert read(path)["options"] == {"min_correlation": 1.0}
+    assert read(path)["answered"] == 0
+    assert "option min_agreement is now min_correlation" in capsys.readouterr().err
+
+
+@pytest.mark.slow
 def test_two_processes_find_what_one_does(room_scene, tmp_path):
     for jobs in ("1", "2"):
         assert main([str(room_scene), *QUICK, "--jobs", jobs, "--json", str(tmp_path / f"{jobs}.json")]) == 0
@@ -137,6 +155,7 @@ def test_two_processes_find_what_one_does(room_scene, tmp_path):
     assert without_times(one) == without_times(two)
 
 
+@pytest.mark.slow
 def test_joblibs_own_configuration_chooses_the_backend(room_scene, tmp_path):
     path = tmp_path / "report.json"
     with joblib.parallel_config(backend="threading", n_jobs=2):
@@ -188,6 +207,7 @@ def test_another_setting_starts_over_and_keeps_the_others(room_scene, tmp_path, 
         assert read(path)["seed"] == int(seed)
 
 
+@pytest.mark.slow
 def test_another_map_starts_over(room_scene, tmp_path, capsys):
     path = tmp_path / "report.json"
     arguments = [str(room_scene), *QUICK, "--limit", "1", "--json", str(path)]
@@ -245,6 +265,9 @@ def test_fingerprint_knows_what_results_depend_on(room_scene, monkeypatch):
         (["--set", "max_passes"], "max_passes is not OPTION=VALUE"),
         (["--set", "max_passes=1.5"], "'1.5' is not a number"),
         (["--set", "seed=1"], "seed=1 is not OPTION=VALUE"),
+        (["--set", "cauchy_scale=1"], "cauchy_scale=1 is not OPTION=VALUE"),
+        (["--ablation", "renderer"], "renderer is not one of nothing, tracking"),
+        (["--without", "renderer"], "renderer is not one of nothing, tracking"),
         (["--jobs", "0"], "'0' is not a number of at least 1"),
         (["--protocol", "priors-file"], "--priors and --protocol priors-file need each other"),
         (["--priors", "a.txt"], "--priors and --protocol priors-file need each other"),
@@ -263,8 +286,10 @@ def test_help_names_the_options_of_the_localizer(capsys):
         main(["--help"])
     printed = "".join(capsys.readouterr().out.split())
     own = ("max_image_width", "seed")  # --max-width and --seed
-    names = [field.name for field in fields(LocalizerOptions) if field.name not in own]
+    names = [parameter.name for parameter in parameters_of(LocalizerOptions) if parameter.name not in own]
+    assert {"max_views", "max_reprojection_error", "min_inliers"} < set(names)
     assert ",".join(names) in printed
+    assert "--without" not in printed
 
 
 def test_command_on_a_folder_without_a_scene(tmp_path, capsys):

@@ -17,10 +17,6 @@ from gsfeatloc_ros.common.geometry import make_pose, so3_exp
 from gsfeatloc_ros.node.encode import image_message, pose_message
 from gsfeatloc_ros.ros_io.decode import ENCODINGS, decode_camera, decode_image, decode_pose, validate_image
 
-# A slow, shared machine is no reason to fail.
-settings.register_profile("unhurried", deadline=None)
-settings.load_profile("unhurried")
-
 COLOUR_ORDER = {"rgb8": "rgb", "bgr8": "bgr", "rgba8": "rgba", "bgra8": "bgra", "8UC3": "bgr", "8UC4": "bgra"}
 DEEP_COLOUR_ORDER = {"rgb16": "rgb", "bgr16": "bgr", "rgba16": "rgba", "bgra16": "bgra"}
 PLANAR_ORDER = {"nv21": "vu", "nv24": "uv"}

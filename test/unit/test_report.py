@@ -73,10 +73,11 @@ def page(tmp_path_factory, room, room_camera, room_map_file):
         tasks = [Task(run, "", scene.photos[prior.photo].name, prior) for prior in draw_priors(run, scene)]
         if protocol in SWEEPS:
             tasks = tasks[::5]
-        runs.append(RunResults(run, tasks, [localize(task)[0] for task in tasks]))
+        runs.append(RunResults(run, tasks, [localize(task) for task in tasks]))
     return write_report(folder, runs, "evaluate <bonsai>").read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_page_needs_nothing_else(page):
     parsed = Page(page)
     assert parsed.open == []
@@ -89,6 +90,7 @@ def test_page_needs_nothing_else(page):
     assert {address[1:] for address in parsed.addresses if address.startswith("#")} <= anchors
 
 
+@pytest.mark.slow
 def test_page_has_all_cases_with_their_figures(page):
     text = Page(page).text
     for protocol in ("paper", "chen", "sweep-rotation", "sweep-translation"):
@@ -102,6 +104,7 @@ def test_page_has_all_cases_with_their_figures(page):
     assert not re.search(r"\bnan\b", text, re.IGNORECASE)
 
 
+@pytest.mark.slow
 def test_page_cites_the_published_figures_of_the_data_set(page):
     text = Page(page).text
     assert "over all 9 scenes of Mip-NeRF360" in text
@@ -111,6 +114,7 @@ def test_page_cites_the_published_figures_of_the_data_set(page):
     assert text.count("over all 9 scenes") == 1
 
 
+@pytest.mark.slow
 def test_worst_queries_are_shown_with_the_reason(page):
     text = " ".join(Page(page).text.split())
     assert "not answered 1.png (default sift, " in text
@@ -128,6 +132,7 @@ def test_worst_queries_are_shown_with_the_reason(page):
     assert image[:, 340:640].mean() > 40
 
 
+@pytest.mark.slow
 def test_command_writes_the_report_and_goes_on_from_it(tmp_path, room, room_camera, room_map_file, capsys):
     folder = tmp_path / "<b>&amp; room"
     folder.mkdir()
@@ -165,20 +170,17 @@ def made(**changes):
     """A result of a right answer, but for `changes`."""
     result = QueryResult(
         photo="a.png",
+        step=0,
         prior_rotation_error_deg=10.0,
         prior_translation_error=0.2,
         answered=True,
         success=True,
         rotation_error_deg=0.1,
         translation_error=0.001,
-        matches=100,
-        inliers=80,
-        passes=3,
-        milliseconds=200.0,
-        reason="found",
-        step=0,
         status="localized",
-        evidence={},
+        reason="found",
+        evidence={"matches": 100, "inliers": 80, "passes": 3},
+        milliseconds=200.0,
         stage_milliseconds={"render": 50.0, "match": 100.0, "total": 190.0},
         nees=1.0,
         in_ellipsoid={"50": False, "90": True, "95": True},
@@ -267,8 +269,7 @@ def test_pictures_side_by_side():
 
 def test_no_matches_mark_nothing():
     photo, render = grey(40, 50, 10), grey(40, 50, 20)
-    none = Matches(np.empty((0, 2)), np.empty((0, 2)), np.empty(0))
-    np.testing.assert_array_equal(mark_matches(photo, render, none), [photo, render])
+    np.testing.assert_array_equal(mark_matches(photo, render, Matches.none()), [photo, render])
 
 
 def test_both_ends_of_a_match_are_ringed_in_one_colour():

@@ -44,7 +44,7 @@ _STAGE_COLOURS = ("#0072b2", "#56b4e9", "#009e73", "#e69f00", "#cc79a7", "#d55e0
 
 
 def success_curves(named: Named, rotation: bool) -> str:
-    """Success against the error of the prior, of a sweep of the rotation or else of the translation."""
+    """Plot success against the error of the prior, of a sweep of the rotation or else of the translation."""
     with _Canvas(1, height=3.2) as canvas:
         (axes,) = canvas.axes
         for (name, results), colour in zip(named, _cycle(_COLOURS), strict=False):
@@ -63,7 +63,7 @@ def success_curves(named: Named, rotation: bool) -> str:
 
 
 def error_histograms(named: Named) -> str:
-    """How large the errors are."""
+    """Plot how large the errors are."""
     with _Canvas(2, height=3.1) as canvas:
         kinds = (
             ("rotation_error_deg", "Rotation error", "degrees", MAX_ROTATION_ERROR_DEG, 1e-4),
@@ -91,7 +91,7 @@ def error_histograms(named: Named) -> str:
 
 
 def calibration(named: Named) -> str:
-    """How many truths the ellipsoids hold against how many they should, and the spread of the NEES."""
+    """Plot how many truths the ellipsoids hold against how many they should, and the spread of the NEES."""
     with _Canvas(2, height=3.3) as canvas:
         coverage, spread = canvas.axes
         nominal = np.linspace(0, 1, 101)
@@ -125,7 +125,7 @@ def calibration(named: Named) -> str:
 
 
 def stage_times(named: Named) -> str:
-    """Where the time goes, in milliseconds a photo on average."""
+    """Plot where the time goes, in milliseconds a photo on average."""
     with _Canvas(1, height=0.9 + 0.42 * len(named)) as canvas:
         (axes,) = canvas.axes
         stages = list(dict.fromkeys(stage for _, results in named for r in results for stage in r.stage_milliseconds))
@@ -163,7 +163,7 @@ class _Canvas:
         return self
 
     def legend(self) -> None:
-        """One legend for all axes, above them."""
+        """Draw one legend for all axes, above them."""
         handles, labels = self.axes[0].get_legend_handles_labels()
         self._figure.legend(handles, labels, loc="outside upper left", ncols=4)
 

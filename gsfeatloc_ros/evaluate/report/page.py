@@ -1,4 +1,4 @@
-"""Fills the page of the report."""
+"""The page of the report, filled."""
 
 from __future__ import annotations
 
@@ -120,7 +120,7 @@ def _case(groups: list[Group]) -> Case:
 
 
 def _worst(runs: Sequence[RunResults]) -> list[tuple[str, list[WorstQuery]]]:
-    """The worst queries of each scene: of this package's method where it was run, and not of sweeps if possible."""
+    """Return the worst queries of each scene: of this package's method if it was run, and not of sweeps if possible."""
     worst = []
     for scene in dict.fromkeys(results.run.scene for results in runs):
         chosen = [results for results in runs if results.run.scene == scene]

@@ -1,4 +1,4 @@
-"""What GSFeatLoc published, to stand beside what is measured here.
+"""Figures that GSFeatLoc published, to stand beside what is measured here.
 
 Jongwon Lee and Timothy Bretl: GSFeatLoc: Visual Localization Using Feature Correspondence on 3D Gaussian Splatting,
 arXiv 2504.20379, 2025. The figures are those of the authors' repository, github.com/jongwonjlee/gsfeatloc, README.md of
@@ -19,7 +19,7 @@ SOURCE = (
 
 @dataclass(frozen=True)
 class PublishedFigures:
-    """What was published of a method: rotation error in degrees, translation error over the scene's scale."""
+    """Published figures of a method: rotation error in degrees, translation error over the scene's scale."""
 
     method: str
     mean_rotation_error_deg: float
@@ -30,7 +30,7 @@ class PublishedFigures:
 
 @dataclass(frozen=True)
 class PublishedTable:
-    """What was published of a data set, over all its scenes."""
+    """Published figures of a data set, over all its scenes."""
 
     dataset: str
     images: int
@@ -87,5 +87,5 @@ TABLES = (
 
 
 def published_table(scene: str) -> PublishedTable | None:
-    """What was published of the data set that a scene, by its name, is of; None if it is of none."""
+    """Return what was published of the data set that a scene, by its name, is of; None if it is of none."""
     return next((table for table in TABLES if scene.lower() in table.scenes), None)

@@ -14,6 +14,7 @@ tensor come down to the three at the end of this file, so that it works in all t
 from __future__ import annotations
 
 import functools
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import SimpleNamespace
@@ -35,6 +36,10 @@ _WAITING = {
     "equal", "nonzero", "masked_select", "_unique", "_unique2", "unique_dim", "bincount",
     "unique_consecutive", "histc", "_linalg_check_errors", "_linalg_svd", "_linalg_eigh", "linalg_eig", "linalg_lstsq",
 }  # fmt: skip
+
+
+# The release of torch with which the tests' counts of operations, copies and waits were made.
+COUNTED_WITH = "2.13"
 
 
 class SimulatedGpu:
@@ -60,6 +65,15 @@ class SimulatedGpu:
         self.to_host: list[int] = []
         self.to_device: list[int] = []
         self.waits: list[str] = []
+
+    def explain(self) -> str:
+        """Return what to make of a count that a test did not expect, and what was counted."""
+        return (
+            f"\nCounted with torch {COUNTED_WITH}; this is {torch.__version__}. Another torch may take operations "
+            "apart otherwise, or wait where that one did not: if the code asks for the same as before, count anew.\n"
+            f"operations: {len(self.operations)}, {dict(Counter(self.operations).most_common())}\n"
+            f"bytes to the host: {self.to_host}\nbytes to the device: {self.to_device}\nwaits: {self.waits}"
+        )
 
     def _copy(self, name: str, source: torch.Tensor, to_device: bool, non_blocking: bool = False) -> None:
         if to_device and isinstance(source, SimulatedTensor):

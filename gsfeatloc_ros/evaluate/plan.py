@@ -1,0 +1,147 @@
+"""An evaluation from start to end: all combinations of settings, what a record has of them, and the rest localized."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from gsfeatloc_ros.evaluate.metrics import QueryResult
+from gsfeatloc_ros.evaluate.record import Fingerprint, Record, fingerprint_of, hash_scene
+from gsfeatloc_ros.evaluate.run import PRIORS_FILE, Run, Task, draw_priors, localize_all
+from gsfeatloc_ros.evaluate.scene import load_scene
+from gsfeatloc_ros.evaluate.tables import RunResults
+
+
+@dataclass(frozen=True)
+class Combinations:
+    """Settings of which all combinations are run.
+
+    Attributes:
+        scenes: folders with their maps; None for the map in the folder.
+        priors_file: for the protocol PRIORS_FILE.
+        max_width: as in Run, one for all.
+        options: values by the name of a parameter of LocalizerOptions.
+        protocols, methods, matchers, sigmas, seeds, ablations, corruptions: as in Run.
+    """
+
+    scenes: Sequence[tuple[Path, Path | None]]
+    protocols: Sequence[str]
+    priors_file: Path | None
+    methods: Sequence[str]
+    matchers: Sequence[str]
+    sigmas: Sequence[float]
+    seeds: Sequence[int]
+    max_width: int
+    options: dict[str, list[float]]
+    ablations: Sequence[str] = ("",)
+    corruptions: Sequence[str] = ("",)
+
+    def runs(self) -> list[Run]:
+        """Return all combinations, those next to each other that need the same map and matcher."""
+        values = [[(name, value) for value in values] for name, values in self.options.items()]
+        return [
+            Run(
+                scene=scene,
+                map_path=map_path,
+                protocol=protocol,
+                priors_file=self.priors_file if protocol == PRIORS_FILE else None,
+                method=method,
+                matcher=matcher,
+                sigma=sigma,
+                seed=seed,
+                max_width=self.max_width,
+                options=options,
+                ablation=ablation,
+                corruption=corruption,
+            )
+            for scene, map_path in self.scenes
+            for matcher, method, protocol, sigma, seed in itertools.product(
+                self.matchers, self.methods, self.protocols, self.sigmas, self.seeds
+            )
+            # The published recipe has no options and is taken whole.
+            for options in (itertools.product(*values) if method == "default" else [()])
+            for ablation in (self.ablations if method == "default" else [""])
+            for corruption in self.corruptions
+        ]
+
+
+class Evaluation:
+    """Runs with what a record has of their results; `localize` does the rest.
+
+    Attributes:
+        record: where the results are kept.
+        recorded: number of results that the record had of any run when the evaluation began.
+        queries: number of queries of all runs.
+    """
+
+    def __init__(self, runs: Sequence[Run], limit: int, record: Record) -> None:
+        """Load the scenes, draw the priors and look up what the record has.
+
+        Args:
+            runs: those of one scene next to each other.
+            limit: only the first photos of each scene; 0 for all.
+            record: where the results are kept.
+
+        Raises:
+            ValueError, RuntimeError, OSError: a scene or a file of priors cannot be used.
+        """
+        self.record = record
+        self.recorded = len(record)
+        self._plans = {plan.run: plan for plan in _plans(runs, limit, record)}
+        self.queries = sum(len(plan.tasks) for plan in self._plans.values())
+
+    @property
+    def to_do(self) -> list[Task]:
+        """The tasks that have no result yet."""
+        return [task for plan in self._plans.values() for task in plan.tasks if _query(task) not in plan.found]
+
+    def localize(self, jobs: int | None) -> Iterator[Task]:
+        """Localize what is to do, and yield each task when its result is in the record; arguments as `localize_all`."""
+        for task, result in localize_all(self.to_do, jobs):
+            plan = self._plans[task.run]
+            plan.found[_query(task)] = result
+            self.record.append(plan.fingerprint, result)
+            yield task
+
+    def results(self) -> list[RunResults]:
+        """Return the results of all runs, once nothing is left to do."""
+        return [
+            RunResults(plan.run, plan.tasks, [plan.found[_query(task)] for task in plan.tasks])
+            for plan in self._plans.values()
+        ]
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """A run with its tasks, and the results that are there of them by photo and step."""
+
+    run: Run
+    fingerprint: Fingerprint
+    tasks: list[Task]
+    found: dict[tuple[str, int], QueryResult]
+
+
+def _plans(runs: Sequence[Run], limit: int, record: Record) -> Iterator[_Plan]:
+    """Yield the tasks of all runs with what the record has of them."""
+    for (folder, map_path), group in itertools.groupby(runs, key=lambda run: (run.scene, run.map_path)):
+        scene = load_scene(folder, map_path)
+        scene_hash = hash_scene(scene)
+        photos = limit or len(scene.photos)
+        for run in group:
+            priors = draw_priors(run, scene)
+            fingerprint = fingerprint_of(run, scene_hash, priors)
+            tasks = [
+                Task(run, fingerprint.version, scene.photos[prior.photo].name, prior)
+                for prior in priors
+                if prior.photo < photos
+            ]
+            if not tasks:
+                raise ValueError(f"{run.priors_file}: has no prior of the first {photos} photos")
+            yield _Plan(run, fingerprint, tasks, record.done(fingerprint))
+
+
+def _query(task: Task) -> tuple[str, int]:
+    """Return what tells a task from the others of its run: the photo and the step."""
+    return task.photo, task.prior.step
