@@ -10,6 +10,7 @@ import numpy as np
 
 from gsfeatloc_ros.common.photo import Photo
 from gsfeatloc_ros.localize.evidence import Evidence
+from gsfeatloc_ros.localize.protection import ProtectionLevel, protection_level
 from gsfeatloc_ros.match.base import Matches
 from gsfeatloc_ros.render.base import Render
 
@@ -43,6 +44,11 @@ class Estimate:
     covariance: np.ndarray | None = None
     evidence: Evidence = field(default_factory=Evidence)
     milliseconds: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def protection(self) -> ProtectionLevel | None:
+        """How far the pose may be off; None unless LOCALIZED."""
+        return None if self.covariance is None else protection_level(self.covariance)
 
     @property
     def localized(self) -> bool:
