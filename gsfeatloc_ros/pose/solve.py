@@ -23,8 +23,9 @@ MIN_POINTS = 4
 _MIN_PIXEL_SIGMA = 0.1
 _REFINE_ITERATIONS = 20
 _NOISE_ITERATIONS = 5
-# Matches nearer to each other than this, in pixels, are neighbours.
+# Matches nearer to each other than this, in pixels, are neighbours; all pairs of at most so many are looked at.
 _NEIGHBOUR_DISTANCE = 25.0
+_MAX_PAIRED = 1000
 # Poses that are not plausible are passed over, with their inliers, this many times.
 _MAX_IMPLAUSIBLE_POSES = 3
 # A step that lowers the cost by less than this share ends the refinement: a thousandth of a standard deviation is left.
@@ -104,30 +105,34 @@ def solve_pose(
         options: of the solver.
         seed: of RANSAC's sampling.
         plausible: whether a pose (4, 4) may be the one that is looked for. If not, as when something in the photo is
-            seen somewhere else in the map, the pose is looked for in the matches that do not agree with it.
+            seen somewhere else in the map, a pose that is is looked for in the matches that do not agree with it.
 
     Returns:
-        The solution, or None where fewer than MIN_POINTS matches agree on a pose.
+        The solution, one that is not plausible where there is no other; None where fewer than MIN_POINTS matches agree
+        on a pose.
     """
+    first: PoseSolution | None = None
     others = np.arange(len(found.pixels))
     for _ in range(_MAX_IMPLAUSIBLE_POSES + 1):
         solved = _solve(camera, found.select(others), options, seed)
         if solved is None:
-            return None
-        T_map_camera, covariance, inliers = solved
+            break
+        T_map_camera, covariance = solved
+        errors = reprojection_errors(camera, T_map_camera, found)
+        inliers = errors <= options.max_reprojection_error
+        rms = float(np.sqrt(np.mean(errors[inliers] ** 2)))
+        solution = PoseSolution(T_map_camera, covariance, errors, inliers, rms)
         if plausible(T_map_camera):
-            errors = reprojection_errors(camera, T_map_camera, found)
-            inliers = errors <= options.max_reprojection_error
-            rms = float(np.sqrt(np.mean(errors[inliers] ** 2)))
-            return PoseSolution(T_map_camera, covariance, errors, inliers, rms)
-        others = others[~inliers]
-    return None
+            return solution
+        first = first or solution
+        others = others[~inliers[others]]
+    return first
 
 
 def _solve(
     camera: Camera, found: Correspondences, options: PoseOptions, seed: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-    """Return the pose (4, 4) that most matches agree on, its covariance (6, 6) and its inliers (M,) bool, or None."""
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return the pose (4, 4) that most matches agree on, and its covariance (6, 6), or None."""
     sampled = ransac_pose(camera, found, options.max_reprojection_error, seed)
     if sampled is None:
         return None
@@ -135,11 +140,8 @@ def _solve(
     refined = refine_pose(camera, start, found.select(inliers), options)
     if refined is None:
         return None
-    T_map_camera, covariance = refined
-    inliers = reprojection_errors(camera, T_map_camera, found) <= options.max_reprojection_error
-    if inliers.sum() < MIN_POINTS:
-        return None
-    return T_map_camera, covariance, inliers
+    agreeing = reprojection_errors(camera, refined[0], found) <= options.max_reprojection_error
+    return refined if agreeing.sum() >= MIN_POINTS else None
 
 
 def ransac_pose(
@@ -252,6 +254,8 @@ def shared_variance(pixels: np.ndarray, residuals: np.ndarray, options: PoseOpti
             it was calibrated.
         options: how much of that is taken to be common to all.
     """
+    step = 1 + len(pixels) // _MAX_PAIRED
+    pixels, residuals = pixels[::step], residuals[::step]
     squares = (pixels**2).sum(axis=1)
     near = squares[:, None] + squares - 2 * pixels @ pixels.T < _NEIGHBOUR_DISTANCE**2
     np.fill_diagonal(near, False)
