@@ -376,7 +376,7 @@ def answer(degrees, distance, covariance=None):
 
 FAILED = Estimate(Status.FAILED, "3 matches", evidence=Evidence(matches=3))
 REJECTED = Estimate(
-    Status.REJECTED, "no agreement", evidence=Evidence(matches=50, inliers=9, passes=2, reprojection_error_px=1.5)
+    Status.REJECTED, "no correlation", evidence=Evidence(matches=50, inliers=9, passes=2, reprojection_error_px=1.5)
 )
 PHOTO = PosedPhoto("a.png", Path("a.png"), CAMERA, np.eye(4))
 

@@ -1,16 +1,19 @@
 """The command: what it writes and prints, several processes, and going on where it was interrupted."""
 
+import ast
 import json
 from dataclasses import asdict
+from pathlib import Path
 
 import joblib
 import numpy as np
 import pytest
 from room_datasets import write_nerfstudio
 
+import gsfeatloc_ros
 from gsfeatloc_ros.common.geometry import quaternion_from_matrix
 from gsfeatloc_ros.common.parameter import parameters_of
-from gsfeatloc_ros.evaluate.record import fingerprint_of, hash_scene
+from gsfeatloc_ros.evaluate.record import _NOT_MEASURED, fingerprint_of, hash_scene
 from gsfeatloc_ros.evaluate.run import Run, draw_priors
 from gsfeatloc_ros.evaluate.scene import load_scene
 from gsfeatloc_ros.localize.options import LocalizerOptions
@@ -247,6 +250,19 @@ def test_fingerprint_knows_what_results_depend_on(room_scene, monkeypatch):
     transforms = read(room_scene / "transforms.json")
     (room_scene / "transforms.json").write_text(json.dumps(transforms | {"cx": 160.0}))
     assert differ(before, fingerprint()) == ["code", "photos"]
+
+
+def test_nothing_that_is_measured_imports_what_no_result_depends_on():
+    root = Path(gsfeatloc_ros.__file__).parent
+    unmeasured = [root / name for name in _NOT_MEASURED]
+    assert all(room.is_dir() for room in unmeasured)
+    names = {f"gsfeatloc_ros.{name.replace('/', '.')}" for name in _NOT_MEASURED}
+    for source in root.rglob("*.py"):
+        if any(map(source.is_relative_to, unmeasured)):
+            continue
+        for node in ast.walk(ast.parse(source.read_text())):
+            if isinstance(node, ast.ImportFrom):
+                assert not any(f"{node.module}.".startswith(f"{name}.") for name in names), source
 
 
 # What the command refuses
