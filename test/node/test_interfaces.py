@@ -1,4 +1,4 @@
-"""The typed service, as it is built from interfaces/, and how it is built."""
+"""The typed service and message, as they are built from interfaces/, and how they are built."""
 
 from __future__ import annotations
 
@@ -11,9 +11,12 @@ import numpy as np
 import pytest
 import rclpy
 from ament_index_python.packages import get_package_share_directory
+from gsfeatloc_interfaces.msg import ProtectionLevel
 from gsfeatloc_interfaces.srv import LocalizeImage
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.serialization import deserialize_message, serialize_message
+
+from gsfeatloc_ros.localize.protection import RISK
 
 ROOT = Path(__file__).parents[2]
 STATUSES = {"LOCALIZED": 0, "REJECTED": 1, "FAILED": 2, "REFUSED": 3, "ERROR": 4}
@@ -33,6 +36,9 @@ def test_response_has_the_fields():
         "status": "uint8",
         "reason": "string",
         "pose": "geometry_msgs/PoseWithCovarianceStamped",
+        "probability_wrong": "double",
+        "protection_radius": "double",
+        "protection_angle": "double",
         "inliers": "uint32",
         "milliseconds": "double",
     }
@@ -40,6 +46,16 @@ def test_response_has_the_fields():
 
 def test_statuses_are_constants_of_the_response():
     assert {name: getattr(LocalizeImage.Response, name) for name in STATUSES} == STATUSES
+
+
+def test_protection_level_has_the_fields():
+    assert ProtectionLevel.get_fields_and_field_types() == {
+        "header": "std_msgs/Header",
+        "radius": "double",
+        "angle": "double",
+        "risk": "double",
+    }
+    assert ProtectionLevel().risk == RISK
 
 
 def test_empty_request_has_no_prior():
@@ -81,9 +97,10 @@ def test_service_answers_over_dds():
         rclpy.shutdown(context=context)
 
 
-def test_service_file_is_installed_with_its_comments():
-    installed = Path(get_package_share_directory("gsfeatloc_interfaces")) / "srv" / "LocalizeImage.srv"
-    assert installed.read_text() == (ROOT / "interfaces" / "srv" / "LocalizeImage.srv").read_text()
+@pytest.mark.parametrize("file", ["msg/ProtectionLevel.msg", "srv/LocalizeImage.srv"])
+def test_files_are_installed_with_their_comments(file):
+    installed = Path(get_package_share_directory("gsfeatloc_interfaces")) / file
+    assert installed.read_text() == (ROOT / "interfaces" / file).read_text()
 
 
 def test_manifest_agrees_with_that_of_the_node():
