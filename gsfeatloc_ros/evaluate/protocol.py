@@ -18,6 +18,8 @@ _SWEEP_STEPS = 10
 _CHEN_REPETITIONS = 5
 _CHEN_ROTATION_DEG = (10.0, 40.0)
 _CHEN_TRANSLATION = (0.0, 0.2)  # of the trajectory's radius
+_NEAR_MISS_ROTATION_DEG = (5.0, 20.0)
+_NEAR_MISS_TRANSLATION = (0.1, 0.5)  # of the trajectory's radius
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,19 +105,15 @@ def chen(scene: Scene, sigma: float, seed: int) -> list[Prior]:
 
     Distances and angles are uniformly distributed; `sigma` scales them.
     """
-    radius = trajectory_radius(scene)
-    covariance = PriorError(
-        sigma * np.radians(_root_mean_square(*_CHEN_ROTATION_DEG)),
-        sigma * radius * _root_mean_square(*_CHEN_TRANSLATION),
-    ).covariance
-    priors = []
-    for index, photo in enumerate(scene.photos):
-        for repetition in range(_CHEN_REPETITIONS):
-            rng = np.random.default_rng([seed, index, repetition])
-            translation = sigma * radius * rng.uniform(*_CHEN_TRANSLATION) * random_unit_vector(rng)
-            rotation = sigma * np.radians(rng.uniform(*_CHEN_ROTATION_DEG)) * random_unit_vector(rng)
-            priors.append(Prior(index, repetition, _moved(photo.T_map_camera, rotation, translation), covariance))
-    return priors
+    return _uniform(scene, sigma, seed, _Ranges(_CHEN_ROTATION_DEG, _CHEN_TRANSLATION, _CHEN_REPETITIONS))
+
+
+def near_miss(scene: Scene, sigma: float, seed: int) -> list[Prior]:
+    """Draw one prior a photo as `chen` does, but moved by 0.1 to 0.5 radii and turned by 5 to 20 degrees.
+
+    From there much of the photo is in view, from the wrong side: a pose near the prior must not be believed.
+    """
+    return _uniform(scene, sigma, seed, _Ranges(_NEAR_MISS_ROTATION_DEG, _NEAR_MISS_TRANSLATION, 1))
 
 
 def sweep_rotation(scene: Scene, sigma: float, seed: int) -> list[Prior]:
@@ -133,10 +131,37 @@ def sweep_translation(scene: Scene, sigma: float, seed: int) -> list[Prior]:
 PROTOCOLS: dict[str, Callable[[Scene, float, int], list[Prior]]] = {
     "paper": paper,
     "chen": chen,
+    "near-miss": near_miss,
     "sweep-rotation": sweep_rotation,
     "sweep-translation": sweep_translation,
 }
 SWEEPS = ("sweep-rotation", "sweep-translation")
+
+
+@dataclass(frozen=True)
+class _Ranges:
+    """Ranges of uniformly distributed errors, in degrees and in radii of the trajectory, and the priors a photo."""
+
+    rotation_deg: tuple[float, float]
+    translation: tuple[float, float]
+    repetitions: int
+
+
+def _uniform(scene: Scene, sigma: float, seed: int, ranges: _Ranges) -> list[Prior]:
+    """Draw priors of all photos, moved and turned in random directions by amounts out of ranges times `sigma`."""
+    radius = trajectory_radius(scene)
+    covariance = PriorError(
+        sigma * np.radians(_root_mean_square(*ranges.rotation_deg)),
+        sigma * radius * _root_mean_square(*ranges.translation),
+    ).covariance
+    priors = []
+    for index, photo in enumerate(scene.photos):
+        for repetition in range(ranges.repetitions):
+            rng = np.random.default_rng([seed, index, repetition])
+            translation = sigma * radius * rng.uniform(*ranges.translation) * random_unit_vector(rng)
+            rotation = sigma * np.radians(rng.uniform(*ranges.rotation_deg)) * random_unit_vector(rng)
+            priors.append(Prior(index, repetition, _moved(photo.T_map_camera, rotation, translation), covariance))
+    return priors
 
 
 def _steps(bound: float) -> np.ndarray:

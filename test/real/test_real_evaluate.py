@@ -28,6 +28,8 @@ def test_command_writes_its_report(scenes, tmp_path, capsys, method):
         "options",
         "ablation",
         "corruption",
+        "degradation",
+        "negative",
         "queries",
         "success_rate",
         "rotation_error_deg",
@@ -35,9 +37,11 @@ def test_command_writes_its_report(scenes, tmp_path, capsys, method):
         "answered",
         "wrong_answers",
         "milliseconds",
+        "cpu_milliseconds",
         "nees_mean",
         "nees_median",
         "coverage",
+        "protection_exceeded",
         "per_query",
     ]
     assert (report["scene"], report["protocol"], report["method"]) == ("bonsai", "paper", method)

@@ -2,6 +2,7 @@
 
 import ast
 import json
+import re
 from dataclasses import asdict
 from pathlib import Path
 
@@ -13,6 +14,9 @@ from room_datasets import write_nerfstudio
 import gsfeatloc_ros
 from gsfeatloc_ros.common.geometry import quaternion_from_matrix
 from gsfeatloc_ros.common.parameter import parameters_of
+from gsfeatloc_ros.evaluate.corruptions import CORRUPTIONS
+from gsfeatloc_ros.evaluate.degradations import DEGRADATIONS
+from gsfeatloc_ros.evaluate.negatives import NEGATIVES
 from gsfeatloc_ros.evaluate.record import _NOT_MEASURED, fingerprint_of, hash_scene
 from gsfeatloc_ros.evaluate.run import Run, draw_priors
 from gsfeatloc_ros.evaluate.scene import load_scene
@@ -141,12 +145,68 @@ def test_parts_are_taken_out_and_photos_corrupted_one_at_a_time(room_scene, tmp_
         assert (f"{old} is now {new}; the old name works until the next release" in said) == (ablation == "--without")
 
 
-def test_the_old_name_of_a_localizer_option_works_with_a_notice(room_scene, tmp_path, capsys):
-    path = tmp_path / "report.json"
-    assert main([str(room_scene), *QUICK, "--set", "min_agreement=1.0", "--limit", "1", "--json", str(path)]) == 0
-    assert read(path)["options"] == {"min_correlation": 1.0}
-    assert read(path)["answered"] == 0
-    assert "option min_agreement is now min_correlation" in capsys.readouterr().err
+@pytest.mark.slow
+def test_maps_are_degraded_one_way_at_a_time(room_scene, tmp_path, capsys):
+    path = tmp_path / "degraded.json"
+    assert main([str(room_scene), *QUICK, "--degrade", "nothing,haze,grown", "--limit", "1", "--json", str(path)]) == 0
+    runs = read(path)["runs"]
+    assert [run["degradation"] for run in runs] == ["", "haze", "grown"]
+    assert len({run["per_query"][0]["rotation_error_deg"] for run in runs}) == 3
+    assert "default sift haze map" in capsys.readouterr().out
+
+
+@pytest.fixture(scope="module")
+def trust(tmp_path_factory, room_camera, photos, room_map_file):
+    """Folder of what `--suite trust` wrote of one photo of a room, and of another room; and the arguments."""
+    folder = tmp_path_factory.mktemp("trust")
+    scenes = []
+    for name in ("room", "hall"):
+        (folder / name).mkdir()
+        camera = room_camera.scaled(320, 240)
+        scenes.append(str(write_nerfstudio(folder / name, camera, photos[:2], room_map_file)))
+    # The hall is the room: its photos are of the room, which no negative should be, and are answered.
+    arguments = [*scenes, *QUICK, "--suite", "trust", "--set", "max_views=0", "--limit", "1"]
+    assert main([*arguments, "--json", str(folder / "trust.json"), "--report", str(folder)]) == 0
+    return folder, arguments
+
+
+@pytest.mark.slow
+def test_the_suite_runs_everything(trust):
+    folder, _ = trust
+    report = read(folder / "trust.json")
+    room = [run for run in report["runs"] if run["scene"] == "room"]
+    assert [run["corruption"] for run in room if run["corruption"]] == list(CORRUPTIONS)
+    assert [run["degradation"] for run in room if run["degradation"]] == list(DEGRADATIONS)
+    assert [run["negative"] for run in room if run["negative"]] == [*NEGATIVES, "hall"]
+    assert [run["protocol"] for run in room].count("near-miss") == 1
+    assert all(run["queries"] == 1 for run in room)
+    total = report["trust"][-1]
+    assert (total["kind"], total["name"], total["queries"]) == ("all", "", 2 * len(room))
+    rows = {row["name"]: row for row in report["trust"]}
+    assert rows["dark photos"]["queries"] == 2
+    assert rows["haze map"]["kind"] == "degraded maps"
+    # An answer to a photo that is not of the scene would be wrong.
+    assert rows["of hall"]["wrong"] == rows["of hall"]["queries"] - rows["of hall"]["right"]
+    assert rows["black"] == rows["black"] | {"right": 2, "wrong": 0, "nees": None, "answers": 0}
+    assert rows["priors of paper"]["right"] == 2
+    page = (folder / "index.html").read_text()
+    assert page.count("Whether answers can be trusted") == 4  # of each scene and protocol
+    assert "photos that are not of the scene" in page
+
+
+@pytest.mark.slow
+def test_the_suite_goes_on_where_it_was(trust, capsys):
+    folder, arguments = trust
+    record = folder / "results.jsonl"
+    lines = record.read_text().splitlines(keepends=True)
+    record.write_text("".join(lines[:-3]))
+    queries = read(folder / "trust.json")["trust"][-1]["queries"]
+    assert main([*arguments, "--report", str(folder)]) == 0
+    printed = capsys.readouterr().out
+    found = int(re.search(rf"has (\d+) of the {queries} results already", printed)[1])
+    assert queries - 3 <= found < queries
+    table = [line.split("  ")[0].strip() or line.split("  ")[1] for line in printed.splitlines()]
+    assert {"right photos", "wrong calibrations", "degraded maps", "all", "focal+5 photos"} <= set(table)
 
 
 @pytest.mark.slow
@@ -282,6 +342,14 @@ def test_nothing_that_is_measured_imports_what_no_result_depends_on():
         (["--set", "max_passes=1.5"], "'1.5' is not a number"),
         (["--set", "seed=1"], "seed=1 is not OPTION=VALUE"),
         (["--set", "cauchy_scale=1"], "cauchy_scale=1 is not OPTION=VALUE"),
+        (["--set", "min_inlier_ratio=0.3"], "min_inlier_ratio is no option any more: use max_risk, the largest"),
+        (["--set", "min_correlation=0.3"], "min_correlation is no option any more: use max_risk, the largest"),
+        (["--set", "min_agreement=0.3"], "min_agreement is no option any more: use max_risk, the largest"),
+        (["--degrade", "fog"], "fog is not one of nothing, dropped"),
+        (["--suite", "all"], "invalid choice: 'all'"),
+        (["--suite", "trust", "--corruption", "dark"], "--suite trust has its own --corruption"),
+        (["--suite", "trust", "--degrade", "haze"], "--suite trust has its own --degrade"),
+        (["--suite", "trust", "--protocol", "chen"], "--suite trust has its own --protocol"),
         (["--ablation", "renderer"], "renderer is not one of nothing, tracking"),
         (["--without", "renderer"], "renderer is not one of nothing, tracking"),
         (["--jobs", "0"], "'0' is not a number of at least 1"),

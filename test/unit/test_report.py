@@ -181,9 +181,11 @@ def made(**changes):
         reason="found",
         evidence={"matches": 100, "inliers": 80, "passes": 3},
         milliseconds=200.0,
+        cpu_milliseconds=300.0,
         stage_milliseconds={"render": 50.0, "match": 100.0, "total": 190.0},
         nees=1.0,
         in_ellipsoid={"50": False, "90": True, "95": True},
+        protection_exceeded=False,
     )
     return replace(result, **changes)
 

@@ -1,0 +1,59 @@
+"""What photos, priors and maps are put through: one condition a run, and suites of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from gsfeatloc_ros.evaluate.corruptions import CORRUPTIONS, MISCALIBRATIONS
+from gsfeatloc_ros.evaluate.degradations import DEGRADATIONS
+from gsfeatloc_ros.evaluate.negatives import NEGATIVES
+
+OTHER_SCENES = "other-scenes"
+"""The negatives that are the photos of all the other scenes that are evaluated."""
+
+
+@dataclass(frozen=True)
+class Condition:
+    """What is done to the photos, the priors or the map of a scene.
+
+    Attributes:
+        protocol: how priors are made wrong, as in Run.
+        corruption, degradation: as in Run.
+        negative: as in Run, or OTHER_SCENES.
+    """
+
+    protocol: str = "paper"
+    corruption: str = ""
+    degradation: str = ""
+    negative: str = ""
+
+    def negatives(self, scene: Path, scenes: Sequence[Path]) -> list[str]:
+        """Return the values of Run.negative that this stands for in a scene, one of `scenes`."""
+        if self.negative != OTHER_SCENES:
+            return [self.negative]
+        return [str(other) for other in scenes if other != scene]
+
+
+SUITES: dict[str, tuple[Condition, ...]] = {
+    "trust": (
+        Condition(),
+        Condition(protocol="near-miss"),
+        *(Condition(corruption=name) for name in CORRUPTIONS),
+        *(Condition(degradation=name) for name in DEGRADATIONS),
+        *(Condition(negative=name) for name in (*NEGATIVES, OTHER_SCENES)),
+    )
+}
+"""By name: whether answers can be trusted."""
+
+
+def kind_of(corruption: str, degradation: str, negative: str) -> str:
+    """Return what kind of photos and maps a condition is of, for the parts of a table."""
+    if negative:
+        return "photos that are not of the scene"
+    if degradation:
+        return "degraded maps"
+    if corruption in MISCALIBRATIONS:
+        return "wrong calibrations"
+    return "corrupted photos" if corruption else "right photos"
