@@ -103,7 +103,7 @@ class Limits:
         1e-4, "With a larger probability that the pose is wrong there is no answer.", (1e-9, 1.0), live=True
     )
     min_inliers: int = parameter(
-        20, "With fewer tracked corners that agree on a pose there is no answer.", (4, 100000), live=True
+        30, "With fewer tracked corners that agree on a pose there is no answer.", (4, 100000), live=True
     )
     min_coverage: float = parameter(
         0.1, "With inliers in a smaller share of the image's 8 x 6 cells there is no answer.", (0.0, 1.0), live=True

@@ -42,7 +42,7 @@ def test_good_evidence_has_nothing_against_it() -> None:
 @pytest.mark.parametrize(
     ("name", "limit", "beyond", "says"),
     [
-        ("inliers", 20, 19, "at least 20 needed"),
+        ("inliers", 30, 29, "at least 30 needed"),
         ("probability_wrong", 1e-4, 1.01e-4, "wrong with a probability of 0.0001 (at most 0.0001)"),
         ("coverage", 0.1, 0.0999, "at least 10% needed"),
         ("deviation", 8.0, 8.0001, "standard deviations from the prior (at most 8)"),
