@@ -45,7 +45,8 @@ class Services:
         node.create_service(Trigger, "~/relocalize", self._on_relocalize, callback_group=group)
         if LocalizeImage is None:
             node.get_logger().info(
-                "the service ~/localize_image is off: build the package gsfeatloc_interfaces (interfaces/), source it"
+                "the service ~/localize_image and the topic protection_level are off: build the package "
+                "gsfeatloc_interfaces (interfaces/), source it"
             )
         else:
             node.create_service(LocalizeImage, "~/localize_image", self._on_localize_image, callback_group=group)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import subprocess
 from pathlib import Path
@@ -13,9 +14,11 @@ import rclpy
 from ament_index_python.packages import get_package_share_directory
 from gsfeatloc_interfaces.msg import ProtectionLevel
 from gsfeatloc_interfaces.srv import LocalizeImage
+from node_harness import connected_client, running_localizer, send_inputs
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.serialization import deserialize_message, serialize_message
 
+from gsfeatloc_ros.client.messages import rgb_image
 from gsfeatloc_ros.localize.protection import RISK
 
 ROOT = Path(__file__).parents[2]
@@ -108,6 +111,23 @@ def test_manifest_agrees_with_that_of_the_node():
     for tag in ("version", "license", "maintainer"):
         assert interfaces.findtext(tag) == node.findtext(tag)
     assert interfaces.find("maintainer").get("email") == node.find("maintainer").get("email")
+
+
+def test_the_node_runs_without_them(monkeypatch, room_map_file, room_camera, photo):
+    paths = os.environ["PYTHONPATH"].split(os.pathsep)
+    kept = [path for path in paths if not (Path(path) / "gsfeatloc_interfaces").exists()]
+    assert len(kept) < len(paths)
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(kept))
+    with running_localizer(map__path=room_map_file) as process, connected_client() as client:
+        assert "~/localize_image and the topic protection_level are off: build" in process.output
+        send_inputs(client, room_camera, photo)
+        image = rgb_image(photo.image)
+        answer = client.attempt(image)
+        assert answer.ok, answer
+        assert client.pose_of(image) is not None
+        # It is on /diagnostics all the same.
+        assert float(answer.values["protection_radius"]) > 0
+        assert client.node.count_publishers("protection_level") == 0
 
 
 def built(root: Path, tools: list[str], headers: bool = True, **environment: str) -> subprocess.CompletedProcess:
