@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import Enum
 from pathlib import Path
 
 from gsfeatloc_ros.evaluate.corruptions import CORRUPTIONS, MISCALIBRATIONS
@@ -48,12 +49,22 @@ SUITES: dict[str, tuple[Condition, ...]] = {
 """By name: whether answers can be trusted."""
 
 
-def kind_of(corruption: str, degradation: str, negative: str) -> str:
-    """Return what kind of photos and maps a condition is of, for the parts of a table."""
+class Kind(Enum):
+    """Kinds of conditions: the parts of a table, in their order."""
+
+    RIGHT = "right photos"
+    CORRUPTED = "corrupted photos"
+    MISCALIBRATED = "wrong calibrations"
+    DEGRADED = "degraded maps"
+    NEGATIVE = "photos that are not of the scene"
+
+
+def kind_of(corruption: str, degradation: str, negative: str) -> Kind:
+    """Return the kind of a condition, given what it has of these; the weightiest counts."""
     if negative:
-        return "photos that are not of the scene"
+        return Kind.NEGATIVE
     if degradation:
-        return "degraded maps"
+        return Kind.DEGRADED
     if corruption in MISCALIBRATIONS:
-        return "wrong calibrations"
-    return "corrupted photos" if corruption else "right photos"
+        return Kind.MISCALIBRATED
+    return Kind.CORRUPTED if corruption else Kind.RIGHT

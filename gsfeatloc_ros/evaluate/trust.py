@@ -5,14 +5,16 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from gsfeatloc_ros.evaluate.metrics import QueryResult
+from gsfeatloc_ros.evaluate.negatives import NEGATIVES
 from gsfeatloc_ros.evaluate.run import Run
-from gsfeatloc_ros.evaluate.suites import kind_of
-from gsfeatloc_ros.evaluate.tables import Group, aligned, condition_words
+from gsfeatloc_ros.evaluate.suites import Kind, kind_of
+from gsfeatloc_ros.evaluate.tables import Group, aligned
 
 _HEADINGS = ("", "queries", "right", "WRONG", "NEES", "in 95 %", "beyond level", "CPU-ms")
 
@@ -59,19 +61,19 @@ class TrustRow:
 
 
 def trust_rows(groups: Sequence[Group]) -> list[TrustRow]:
-    """Return the rows of the groups: for each kind its total and, if there are several, its conditions; then the total.
+    """Return the rows of the groups: for each kind its total and its conditions, then the total.
 
     Groups of one condition, as of several scenes, are put together.
     """
-    kinds: dict[str, dict[str, list[QueryResult]]] = {}
+    kinds: dict[Kind, dict[str, list[QueryResult]]] = {}
     for group in groups:
         run = group.run
         conditions = kinds.setdefault(kind_of(run.corruption, run.degradation, run.negative), {})
         conditions.setdefault(_name(run), []).extend(group.results)
     rows = []
-    for kind, conditions in kinds.items():
-        rows.append(_row(kind, "", list(itertools.chain.from_iterable(conditions.values()))))
-        rows += [_row(kind, name, results) for name, results in conditions.items()]
+    for kind, conditions in sorted(kinds.items(), key=lambda item: list(Kind).index(item[0])):
+        rows.append(_row(kind.value, "", list(itertools.chain.from_iterable(conditions.values()))))
+        rows += [_row(kind.value, name, results) for name, results in conditions.items()]
     return [*rows, _row("all", "", [result for group in groups for result in group.results])]
 
 
@@ -89,8 +91,11 @@ def trust_table(groups: Sequence[Group]) -> str:
 
 def _name(run: Run) -> str:
     """Return the name of a run's condition."""
-    words = condition_words(run) or [f"priors of {run.protocol}"]
-    return ", ".join(words).removeprefix("not of the scene: ")
+    negative = f"of {Path(run.negative).name}" if run.negative and run.negative not in NEGATIVES else run.negative
+    names = [name for name in (run.corruption, run.degradation, negative) if name]
+    if run.protocol != "paper" or not names:
+        names.append(f"priors of {run.protocol}")
+    return ", ".join(names)
 
 
 def _row(kind: str, name: str, results: Sequence[QueryResult]) -> TrustRow:

@@ -21,12 +21,6 @@ SIZES = {
     "crop": (160, 120),
     "portrait": (144, 240),
 }
-    "small-320": (320, 240),
-    "small-160": (160, 120),
-    "small-80": (80, 60),
-    "crop": (160, 120),
-    "portrait": (144, 240),
-}
 # SHA-256, cut, of what each made of the photo below when they came to be: figures measured with them stay comparable.
 FIRST = {
     "dark": "448ac729b9226285",
