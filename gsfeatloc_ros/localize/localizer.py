@@ -10,6 +10,7 @@ from functools import partial
 import cv2
 import numpy as np
 
+from gsfeatloc_ros.common.arrays import to_host
 from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.photo import Photo
 from gsfeatloc_ros.common.stage_clock import StageClock
@@ -175,7 +176,7 @@ class Localizer:
         """Render and track at `pose`, then at each estimate, until the render is where the photo is; then verify."""
         view = query.track(pose)
         with query.clock.stage("track"):
-            blur = estimate_blur(query.photo.gray(), cv2.cvtColor(view.render.image(), cv2.COLOR_RGB2GRAY))
+            blur = estimate_blur(query.photo.gray(), cv2.cvtColor(to_host(view.image), cv2.COLOR_RGB2GRAY))
         if blur is not None:
             view = query.track(pose if view.solution is None else view.solution.T_map_camera, blur)
         passes = 1

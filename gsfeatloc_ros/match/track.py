@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 
@@ -14,7 +16,7 @@ from gsfeatloc_ros.match.base import Matches
 # over a block of how many pixels a side that is measured.
 MAX_CORNERS = 800
 # Of a render, that are tracked into the photo.
-MAX_RENDER_CORNERS = 400
+MAX_RENDER_CORNERS = 300
 MIN_CORNER_DISTANCE = 7
 MIN_CORNER_QUALITY = 0.005
 CORNER_BLOCK = 5
@@ -45,20 +47,36 @@ class CornerTracker:
         gray = photo.gray()
         self._structure = _structure(gray)
         self.corners = _find_corners(gray, MAX_CORNERS, seen_off_the_border(photo))
+        self._last_render: _Seen | None = None
 
     def track(self, image: Array) -> Matches:
         """Find the photo's corners in a render (H, W, 3) uint8 RGB of its size.
 
         Corners that cannot be followed there and back are left out.
         """
-        gray = cv2.cvtColor(to_host(image), cv2.COLOR_RGB2GRAY)
-        return _there_and_back(self._structure, _structure(gray), self.corners)
+        return _there_and_back(self._structure, self._see(image).structure, self.corners)
 
     def track_back(self, image: Array) -> Matches:
         """Find the corners of a render (H, W, 3) uint8 RGB in the photo; `a` of the matches are the photo's pixels."""
-        gray = cv2.cvtColor(to_host(image), cv2.COLOR_RGB2GRAY)
-        corners = _find_corners(gray, MAX_RENDER_CORNERS, None)
-        return _there_and_back(_structure(gray), self._structure, corners).swapped()
+        render = self._see(image)
+        corners = _find_corners(render.gray, MAX_RENDER_CORNERS, None)
+        return _there_and_back(render.structure, self._structure, corners).swapped()
+
+    def _see(self, image: Array) -> _Seen:
+        """Return what a render looks like; that of the last one is kept, as it is tracked both ways."""
+        if self._last_render is None or self._last_render.image is not image:
+            gray = cv2.cvtColor(to_host(image), cv2.COLOR_RGB2GRAY)
+            self._last_render = _Seen(image, gray, _structure(gray))
+        return self._last_render
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """A render, its brightness (H, W) uint8 and its local structure (H, W) uint8."""
+
+    image: Array
+    gray: np.ndarray
+    structure: np.ndarray
 
 
 def seen_off_the_border(photo: Photo) -> np.ndarray:

@@ -14,7 +14,9 @@ from gsfeatloc_ros.pose.solve import Correspondences, PoseOptions, shared_varian
 # while the shutter runs from the first row to the last. What they are known to before a photo is seen, as standard
 # deviations: what photos do not show stays near zero.
 _PRIOR_SIGMAS = np.array([0.05, 0.1, 0.03, 0.03, 0.03])
-_ITERATIONS = 6
+# Steps are taken until what they change, in these deviations, is less than a thousandth.
+_MAX_ITERATIONS = 6
+_MIN_STEP = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,32 +63,57 @@ def fit_camera(
     whitening = whiten(camera, pose, found)
     if whitening is None:
         return None
-    for iteration in range(_ITERATIONS + 1):
-        linear = _linearize(camera, pose, extra, found)
-        if linear is None:
+    system = _weigh(_linearize(camera, pose, extra, found), whitening, options)
+    for _ in range(_MAX_ITERATIONS):
+        if system is None:
             return None
-        residuals, jacobian = linear
-        white = np.einsum("mij,mj->mi", whitening, residuals)
-        white_jacobian = whitening @ jacobian
-        squared = (white**2).sum(axis=1)
-        weights = 1.0 / (1.0 + squared / options.cauchy_scale**2)
-        weighted = (weights[:, None, None] * white_jacobian).reshape(-1, len(information))
-        hessian = weighted.T @ white_jacobian.reshape(-1, len(information)) + np.diag(information)
-        if iteration == _ITERATIONS:
-            break
-        gradient = weighted.T @ white.ravel() + information * np.concatenate([np.zeros(6), extra])
-        step = -np.linalg.solve(hessian, gradient)
+        hessian = system.hessian + np.diag(information)
+        step = -np.linalg.solve(hessian, system.gradient + information * np.concatenate([np.zeros(6), extra]))
         pose = make_pose(so3_exp(step[3:6]) @ pose[:3, :3], pose[:3, 3] + step[:3])
         extra = extra + step[6:]
-    inflation = max((weights * squared).sum() / max(2 * weights.sum() - len(information), 1.0), 1.0)
-    plain = (weights[:, None, None] * jacobian).reshape(-1, len(information))
-    of_a_match = plain.T @ jacobian.reshape(-1, len(information)) / weights.sum()
-    shared = shared_variance(found.pixels, residuals, options)
+        system = _weigh(_linearize(camera, pose, extra, found), whitening, options)
+        if np.abs(step[6:] / _PRIOR_SIGMAS).max() < _MIN_STEP:
+            break
+    if system is None:
+        return None
+    hessian = system.hessian + np.diag(information)
+    weights = system.weights
+    inflation = max((weights * system.squared).sum() / max(2 * weights.sum() - len(information), 1.0), 1.0)
+    plain = (weights[:, None, None] * system.jacobian).reshape(-1, len(information))
+    of_a_match = plain.T @ system.jacobian.reshape(-1, len(information)) / weights.sum()
+    shared = shared_variance(found.pixels, system.residuals, options)
     # What the matches have in common counts as one match with that error, beside what is known before.
     covariance = inflation * np.linalg.inv(hessian) + np.linalg.inv(of_a_match / shared + np.diag(information))
     sigmas = np.sqrt(np.diag(covariance))[6:]
     shift = np.concatenate([pose[:3, 3] - T_map_camera[:3, 3], so3_log(pose[:3, :3] @ T_map_camera[:3, :3].T)])
     return CameraFit(extra[0], sigmas[0], extra[1], sigmas[1], extra[2:], sigmas[2:], shift)
+
+
+@dataclass(frozen=True, eq=False)
+class _System:
+    """The robust least squares problem at a pose and camera: residuals (M, 2), Jacobians (M, 2, 11), what follows."""
+
+    residuals: np.ndarray
+    jacobian: np.ndarray
+    squared: np.ndarray
+    weights: np.ndarray
+    hessian: np.ndarray
+    gradient: np.ndarray
+
+
+def _weigh(linear: tuple[np.ndarray, np.ndarray] | None, whitening: np.ndarray, options: PoseOptions) -> _System | None:
+    """Return the whitened problem with Cauchy's weights (iteratively reweighted least squares)."""
+    if linear is None:
+        return None
+    residuals, jacobian = linear
+    white = np.einsum("mij,mj->mi", whitening, residuals)
+    white_jacobian = whitening @ jacobian
+    squared = (white**2).sum(axis=1)
+    weights = 1.0 / (1.0 + squared / options.cauchy_scale**2)
+    size = jacobian.shape[2]
+    weighted = (weights[:, None, None] * white_jacobian).reshape(-1, size)
+    hessian = weighted.T @ white_jacobian.reshape(-1, size)
+    return _System(residuals, jacobian, squared, weights, hessian, weighted.T @ white.ravel())
 
 
 def _linearize(

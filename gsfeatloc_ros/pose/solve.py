@@ -25,7 +25,7 @@ _REFINE_ITERATIONS = 20
 _NOISE_ITERATIONS = 5
 # Matches nearer to each other than this, in pixels, are neighbours; all pairs of at most so many are looked at.
 _NEIGHBOUR_DISTANCE = 25.0
-_MAX_PAIRED = 1000
+_MAX_PAIRED = 400
 # Poses that are not plausible are passed over, with their inliers, this many times.
 _MAX_IMPLAUSIBLE_POSES = 3
 # A step that lowers the cost by less than this share ends the refinement: a thousandth of a standard deviation is left.
