@@ -63,30 +63,37 @@ def fit_camera(
     whitening = whiten(camera, pose, found)
     if whitening is None:
         return None
-    system = _weigh(_linearize(camera, pose, extra, found), whitening, options)
-    for _ in range(_MAX_ITERATIONS):
-        if system is None:
-            return None
-        hessian = system.hessian + np.diag(information)
-        step = -np.linalg.solve(hessian, system.gradient + information * np.concatenate([np.zeros(6), extra]))
-        pose = make_pose(so3_exp(step[3:6]) @ pose[:3, :3], pose[:3, 3] + step[:3])
-        extra = extra + step[6:]
-        system = _weigh(_linearize(camera, pose, extra, found), whitening, options)
-        if np.abs(step[6:] / _PRIOR_SIGMAS).max() < _MIN_STEP:
-            break
-    if system is None:
+    try:
+        for _ in range(_MAX_ITERATIONS):
+            system = _weigh(_linearize(camera, pose, extra, found), whitening, options)
+            if system is None:
+                return None
+            hessian = system.hessian + np.diag(information)
+            step = -np.linalg.solve(hessian, system.gradient + information * np.concatenate([np.zeros(6), extra]))
+            pose = make_pose(so3_exp(step[3:6]) @ pose[:3, :3], pose[:3, 3] + step[:3])
+            extra = extra + step[6:]
+            if np.abs(step[6:] / _PRIOR_SIGMAS).max() < _MIN_STEP:
+                break
+        sigmas = np.sqrt(np.diag(_covariance(system, information, found, options)))[6:]
+    except np.linalg.LinAlgError:
         return None
-    hessian = system.hessian + np.diag(information)
-    weights = system.weights
-    inflation = max((weights * system.squared).sum() / max(2 * weights.sum() - len(information), 1.0), 1.0)
-    plain = (weights[:, None, None] * system.jacobian).reshape(-1, len(information))
-    of_a_match = plain.T @ system.jacobian.reshape(-1, len(information)) / weights.sum()
-    shared = shared_variance(found.pixels, system.residuals, options)
-    # What the matches have in common counts as one match with that error, beside what is known before.
-    covariance = inflation * np.linalg.inv(hessian) + np.linalg.inv(of_a_match / shared + np.diag(information))
-    sigmas = np.sqrt(np.diag(covariance))[6:]
     shift = np.concatenate([pose[:3, 3] - T_map_camera[:3, 3], so3_log(pose[:3, :3] @ T_map_camera[:3, :3].T)])
-    return CameraFit(extra[0], sigmas[0], extra[1], sigmas[1], extra[2:], sigmas[2:], shift)
+    if not (np.isfinite(sigmas).all() and np.isfinite(shift).all()):
+        return None
+    (focal, k1), (focal_sigma, k1_sigma) = extra[:2].tolist(), sigmas[:2].tolist()
+    return CameraFit(focal, focal_sigma, k1, k1_sigma, extra[2:], sigmas[2:], shift)
+
+
+def _covariance(system: _System, information: np.ndarray, found: Correspondences, options: PoseOptions) -> np.ndarray:
+    """Return the covariance (11, 11) of pose and camera, with what the matches have in common, as of a pose."""
+    size, weights = len(information), system.weights
+    inflation = max((weights * system.squared).sum() / max(2 * weights.sum() - size, 1.0), 1.0)
+    weighted = (weights[:, None, None] * system.jacobian).reshape(-1, size)
+    of_a_match = weighted.T @ system.jacobian.reshape(-1, size) / weights.sum()
+    shared = shared_variance(found.pixels, system.residuals, options)
+    # What they have in common counts as one match with that error, beside what is known before.
+    own = np.linalg.inv(system.hessian + np.diag(information))
+    return inflation * own + np.linalg.inv(of_a_match / shared + np.diag(information))
 
 
 @dataclass(frozen=True, eq=False)

@@ -99,3 +99,9 @@ def test_the_shift_is_in_the_axes_of_the_map() -> None:
     fit, solution = fitted(seen(longer(0.03)))
     step = so3_log(POSE[:3, :3] @ solution.T_map_camera[:3, :3].T)
     assert np.linalg.norm(fit.pose_shift[3:] - step) < 0.002
+
+
+def test_matches_that_determine_no_pose_are_no_fit() -> None:
+    found = Correspondences(np.full((30, 2), 100.0), np.full((30, 3), 5.0), np.zeros((30, 3)))
+    fit = fit_camera(CAMERA, make_pose(np.eye(3), np.zeros(3)), found, PoseOptions())
+    assert fit is None or np.isfinite(fit.pose_shift).all()
