@@ -65,9 +65,10 @@ def fit_camera(
         return None
     try:
         for _ in range(_MAX_ITERATIONS):
-            system = _weigh(_linearize(camera, pose, extra, found), whitening, options)
-            if system is None:
+            linear = _linearize(camera, pose, extra, found)
+            if linear is None:
                 return None
+            system = _weigh(*linear, whitening, options)
             hessian = system.hessian + np.diag(information)
             step = -np.linalg.solve(hessian, system.gradient + information * np.concatenate([np.zeros(6), extra]))
             pose = make_pose(so3_exp(step[3:6]) @ pose[:3, :3], pose[:3, 3] + step[:3])
