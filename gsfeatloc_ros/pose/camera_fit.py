@@ -109,11 +109,8 @@ class _System:
     gradient: np.ndarray
 
 
-def _weigh(linear: tuple[np.ndarray, np.ndarray] | None, whitening: np.ndarray, options: PoseOptions) -> _System | None:
+def _weigh(residuals: np.ndarray, jacobian: np.ndarray, whitening: np.ndarray, options: PoseOptions) -> _System:
     """Return the whitened problem with Cauchy's weights (iteratively reweighted least squares)."""
-    if linear is None:
-        return None
-    residuals, jacobian = linear
     white = np.einsum("mij,mj->mi", whitening, residuals)
     white_jacobian = whitening @ jacobian
     squared = (white**2).sum(axis=1)
