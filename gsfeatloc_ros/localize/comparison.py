@@ -34,6 +34,8 @@ _MIN_COVERED = 0.5
 # A cell is compared where so much of it is covered, and so much of that has contrast in one of the pictures.
 _MIN_COVERED_SHARE = 0.3
 _MIN_CONTRAST_SHARE = 0.5
+# Width, in compared pixels, of what is smoothed out of the mask of changes.
+_BRUSH = 7
 # Where the local structures of photo and render correlate less, the photo shows something else than the map.
 _MIN_CORRELATION = 0.5
 
@@ -101,6 +103,9 @@ def changed_mask(photo: Photo, view: MatchedView) -> np.ndarray:
     product, square_photo, square_map = sums
     alike = product >= _MIN_CORRELATION * np.sqrt(square_photo * square_map)
     changed = (compared & ~alike).astype(np.uint8) * 255
+    # Specks and gaps narrower than what is compared mean nothing.
+    brush = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (_BRUSH, _BRUSH))
+    changed = cv2.morphologyEx(cv2.morphologyEx(changed, cv2.MORPH_CLOSE, brush), cv2.MORPH_OPEN, brush)
     return cv2.resize(changed, (photo.camera.width, photo.camera.height), interpolation=cv2.INTER_NEAREST)
 
 

@@ -24,6 +24,8 @@ _FOCAL_SIGMAS = 2.0
 # the logarithm of the odds that the answer is wrong. Ratios count by their logit, correlations by Fisher's z.
 _WEIGHTS = {"inlier_ratio": -1.11, "render_inlier_ratio": -1.61, "correlation": -5.03, "low_correlation": -2.22}
 _OFFSET, _SLOPE = 13.81, 3.07
+# How numbers are written as texts, if not with three decimals.
+_FORMATS = {"probability_wrong": ".1e", "focal_error": ".4f", "focal_sigma": ".4f"}
 # Ratios and correlations are taken to be no nearer to 1 than this.
 _MIN_DOUBT = 0.005
 
@@ -92,7 +94,7 @@ class Evidence:
 def _text(name: str, number: int | float) -> str:
     if isinstance(number, int):
         return str(number)
-    return f"{number:.1e}" if name == "probability_wrong" else f"{number:.3f}"
+    return format(number, _FORMATS.get(name, ".3f"))
 
 
 @dataclass(frozen=True)
@@ -119,7 +121,7 @@ def verdict(evidence: Evidence, limits: Limits) -> tuple[str, ...]:
     if evidence.inliers == 0:
         return (f"photo and render at the estimate have nothing in common: {evidence.counts}",)
     reasons = []
-    if abs(evidence.focal_error) > _MAX_FOCAL_ERROR + _FOCAL_SIGMAS * evidence.focal_sigma:
+    if focal_length_is_wrong(evidence):
         error, sigma = 100 * evidence.focal_error, 100 * evidence.focal_sigma
         reasons.append(
             f"the focal length fits {abs(error):.1f} +- {sigma:.1f} % {'longer' if error > 0 else 'shorter'} than "
@@ -143,6 +145,11 @@ def verdict(evidence: Evidence, limits: Limits) -> tuple[str, ...]:
             f"(at most {limits.max_deviation:g})"
         )
     return tuple(reasons)
+
+
+def focal_length_is_wrong(evidence: Evidence) -> bool:
+    """Return whether the photo contradicts the focal length that was calibrated."""
+    return abs(evidence.focal_error) > _MAX_FOCAL_ERROR + _FOCAL_SIGMAS * evidence.focal_sigma
 
 
 def probability_wrong(evidence: Evidence) -> float:

@@ -17,7 +17,14 @@ from gsfeatloc_ros.common.stage_clock import StageClock
 from gsfeatloc_ros.localize.blur import estimate_blur
 from gsfeatloc_ros.localize.comparison import changed_mask, compare
 from gsfeatloc_ros.localize.estimate import Estimate, Status, Trace
-from gsfeatloc_ros.localize.evidence import Evidence, coverage, deviation, probability_wrong, verdict
+from gsfeatloc_ros.localize.evidence import (
+    Evidence,
+    coverage,
+    deviation,
+    focal_length_is_wrong,
+    probability_wrong,
+    verdict,
+)
 from gsfeatloc_ros.localize.options import LocalizerOptions
 from gsfeatloc_ros.localize.query import Components, MatchedView, Query
 from gsfeatloc_ros.localize.search import (
@@ -155,7 +162,7 @@ class Localizer:
                 if pose is None:
                     continue
                 candidate = self._refine(query, pose, prior)
-                if not candidate.reasons_against:
+                if not candidate.reasons_against or candidate.only_the_camera_is_wrong:
                     return candidate.trace(query.photo, views - 1)
                 rejected = rejected or candidate
         if rejected is not None:
@@ -252,6 +259,11 @@ class _Candidate:
     reasons_against: tuple[str, ...]
 
     @property
+    def only_the_camera_is_wrong(self) -> bool:
+        """Whether nothing but the camera's calibration speaks against it: no other view would help."""
+        return len(self.reasons_against) == 1 and focal_length_is_wrong(self.evidence)
+
+    @property
     def covariance(self) -> np.ndarray:
         """Covariance (6, 6) of the pose: what the camera's errors would move it by is part of it."""
         assert self.view.solution is not None
@@ -267,7 +279,8 @@ class _Candidate:
         else:
             estimate = Estimate(
                 Status.LOCALIZED,
-                f"{evidence.inliers} inliers of {evidence.lifted} corners, correlation {evidence.correlation:.2f}",
+                f"{evidence.inliers} inliers of {evidence.lifted} corners, correlation {evidence.correlation:.2f}; "
+                f"{evidence.changed:.0%} of the photo is not as in the map",
                 view.solution.T_map_camera,
                 self.covariance,
                 evidence,
