@@ -11,7 +11,7 @@ help:
 	@echo "make real   test with real maps and scenes, where they are (test/real/README.md)"
 	@echo "make gpu    test the code for GPUs; without a GPU, on a simulated one"
 	@echo "make gsplat test the GPU renderer with gsplat's own kernels, compiled for the CPU"
-	@echo "make lint   check the style of the code"
+	@echo "make lint   check the style and the types of the code"
 	@echo "make build  build with colcon, into install/"
 	@echo "make clean  remove what the others made, but for .venv"
 
@@ -38,7 +38,7 @@ gsplat: build
 	@. scripts/env.sh && GSPLAT_ON_CPU=.venv/gsplat python -P -m pytest test/gpu/test_gpu.py
 
 lint: setup
-	@. scripts/env.sh && ruff check . && ruff format --check .
+	@. scripts/env.sh && ruff check . && ruff format --check . && mypy
 
 build: setup
 	@scripts/build.sh
@@ -47,4 +47,4 @@ setup:
 	@scripts/setup.sh
 
 clean:
-	rm -rf build install log demo_output .pytest_cache .ruff_cache .hypothesis
+	rm -rf build install log demo_output .pytest_cache .ruff_cache .mypy_cache .hypothesis

@@ -81,6 +81,14 @@ setup(
         "evaluate": evaluate,
         # The matchers superpoint-superglue and superpoint-lightglue. Their weights are for noncommercial research only.
         "superpoint": superpoint,
-        "test": [*evaluate, *superpoint, "hypothesis>=6.100,<7", "pytest>=8,<9", "pyyaml>=6,<7", "ruff>=0.9,<1"],
+        "test": [
+            *evaluate,
+            *superpoint,
+            "hypothesis>=6.100,<7",
+            "mypy>=1.13,<2",
+            "pytest>=8,<9",
+            "pyyaml>=6,<7",
+            "ruff>=0.9,<1",
+        ],
     },
 )

@@ -25,6 +25,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the soak; return the exit status."""
     args = _parse(argv)
     isolate_ros()
+    print(f"soak: the map and the photos are kept in {args.folder}", file=sys.stderr)
     map_file, photos_file = prepare_room(args.folder, args.size)
     robot = multiprocessing.get_context("spawn").Process(
         target=run_robot, args=(photos_file, args.size, args.rate, args.seconds)

@@ -14,7 +14,14 @@ from sensor_msgs.msg import CameraInfo, Image
 from std_srvs.srv import Trigger
 
 from gsfeatloc_ros.client.client_node import ClientNode
-from gsfeatloc_ros.client.messages import camera_info_of, pose_matrix, pose_stamped, rgb_image, stamp_of
+from gsfeatloc_ros.client.messages import (
+    camera_info_of,
+    pose_matrix,
+    pose_stamped,
+    read_diagnostics,
+    rgb_image,
+    stamp_of,
+)
 from gsfeatloc_ros.client.process import START_TIMEOUT
 from gsfeatloc_ros.common.geometry import quaternion_from_matrix, rotation_error_deg, so3_exp, translation_error
 from gsfeatloc_ros.maps import Similarity
@@ -101,9 +108,10 @@ class Robots(ClientNode):
         return future.result()
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
-        for status in message.status:
-            values = {item.key: item.value for item in status.values}
-            self.statuses.setdefault(status.name, {})[values.get("stamp", "")] = values.get("status", status.message)
+        for diagnostic in read_diagnostics(message):
+            values = diagnostic.values
+            answers = self.statuses.setdefault(diagnostic.name, {})
+            answers[values.get("stamp", "")] = values.get("status", diagnostic.reason)
 
 
 @pytest.fixture(scope="module")

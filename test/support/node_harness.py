@@ -113,6 +113,7 @@ class Client(ClientNode):
         self.health: list[Diagnostic] = []
         self.maps: list[Diagnostic] = []
         self._publishers: dict[str, rclpy.publisher.Publisher] = {}
+        self._services: dict[str, rclpy.client.Client] = {}
         image = (Image, "image") if transport == "raw" else (CompressedImage, "image/compressed")
         self._image = self.node.create_publisher(*image, 5)
         self._camera_info = self.node.create_publisher(CameraInfo, "camera_info", 5)
@@ -159,14 +160,15 @@ class Client(ClientNode):
 
     def call(self, service_type: type, name: str, request: object, timeout: float = TIMEOUT) -> object:
         """What a service answers."""
-        client = self.node.create_client(service_type, name)
-        try:
-            assert self.spin_until(client.service_is_ready), f"there is no service {name}"
-            future = client.call_async(request)
-            assert self.spin_until(future.done, timeout), f"no answer from {name}"
-            return future.result()
-        finally:
-            self.node.destroy_client(client)
+        if name not in self._services:
+            self._services[name] = self.node.create_client(service_type, name)
+            assert self.spin_until(self._services[name].service_is_ready), f"there is no service {name}"
+            # The service may take a moment longer to find this client, and would lose its first answer.
+            self.spin(0.5)
+        assert self.spin_until(self._services[name].service_is_ready), f"there is no service {name} any more"
+        future = self._services[name].call_async(request)
+        assert self.spin_until(future.done, timeout), f"no answer from {name}"
+        return future.result()
 
     def set_parameter(self, name: str, value: object) -> SetParametersResult:
         """Set a parameter of the localizer while it runs."""

@@ -53,9 +53,11 @@ def share_in_view(means: np.ndarray, pose: np.ndarray) -> float:
 
 
 def test_time_and_memory_are_those_of_the_block():
-    slept = timed(time.sleep, 0.05)
-    assert slept.wall >= 50
-    assert slept.cpu < 25
+    # Threads of earlier work may go on spinning for a moment, on all cores.
+    time.sleep(0.5)
+    slept = timed(time.sleep, 0.1)
+    assert slept.wall >= 100
+    assert slept.cpu < 50
     with memory_taken() as memory:
         # More than 32 MB each, which malloc takes from the system and never from what was freed before.
         kept = np.ones(5 * 2**20)  # 40 MB

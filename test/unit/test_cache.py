@@ -200,6 +200,7 @@ def test_damaged_cache_is_said_once_and_replaced(map_file, preparations, caplog,
     assert path.read_bytes() == good
 
 
+@pytest.mark.slow
 @settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_no_flipped_byte_goes_unnoticed(map_file, data):

@@ -482,6 +482,7 @@ def test_chi_square_distribution_is_that_of_the_tables():
     assert chi_square_cdf(0.0) == 0
 
 
+@pytest.mark.slow
 @given(seed=st.integers(0, 2**32 - 1))
 def test_nees_is_calibrated_for_errors_of_the_covariance_itself(seed):
     rng = np.random.default_rng(seed)
@@ -552,6 +553,7 @@ def test_success_by_step():
 # Ablation
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ablation", ABLATIONS)
 def test_every_ablation_makes_a_difference(ablation, room_map, room_camera, room_photos):
     photo, matcher = room_photos[0], create_matcher("sift")

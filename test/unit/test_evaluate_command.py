@@ -224,6 +224,7 @@ def test_in_the_suite_the_photos_of_each_scene_are_looked_for_in_all_others():
     assert len(set(maps)) == sum(a != b for a, b in itertools.pairwise(maps)) + 1
 
 
+@pytest.mark.slow
 def test_an_answer_to_a_photo_of_another_scene_is_wrong(room_scene, tmp_path):
     # The hall is the room, so that there is an answer; no map is needed for its photos.
     hall = tmp_path / "hall"
@@ -270,6 +271,7 @@ def test_joblibs_own_configuration_chooses_the_backend(room_scene, tmp_path):
 # Going on
 
 
+@pytest.mark.slow
 def test_what_is_done_is_not_done_again(room_scene, tmp_path, capsys):
     path = tmp_path / "report.json"
     arguments = [str(room_scene), *QUICK, "--json", str(path)]
@@ -286,6 +288,7 @@ def test_what_is_done_is_not_done_again(room_scene, tmp_path, capsys):
     assert read(path)["per_query"] == first["per_query"][:1]
 
 
+@pytest.mark.slow
 def test_a_line_cut_short_is_done_again(room_scene, tmp_path, capsys):
     path = tmp_path / "report.json"
     record = path.with_suffix(".jsonl")
@@ -300,6 +303,7 @@ def test_a_line_cut_short_is_done_again(room_scene, tmp_path, capsys):
     assert "has 2 of the 2 results already" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_another_setting_starts_over_and_keeps_the_others(room_scene, tmp_path, capsys):
     path = tmp_path / "report.json"
     for seed, there in (("0", ""), ("1", "has 0 of the 1 results already"), ("0", "has 1 of the 1 results already")):

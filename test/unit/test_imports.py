@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
@@ -30,8 +31,9 @@ def name_of(source: Path) -> str:
 SOURCES = {name_of(source): source for source in sorted((ROOT / "gsfeatloc_ros").rglob("*.py"))}
 
 
-def imported(module: str, at_import_only: bool = False) -> Iterator[str]:
-    """Yield the names of all that a module imports; with `at_import_only` not what functions import later."""
+@cache
+def imported(module: str, at_import_only: bool = False) -> list[str]:
+    """Return the names of all that a module imports; with `at_import_only` not what functions import later."""
 
     def visit(node: ast.AST) -> Iterator[str]:
         if isinstance(node, ast.Import):
@@ -45,7 +47,7 @@ def imported(module: str, at_import_only: bool = False) -> Iterator[str]:
             for child in ast.iter_child_nodes(node):
                 yield from visit(child)
 
-    yield from visit(ast.parse(SOURCES[module].read_text(encoding="utf-8")))
+    return list(visit(ast.parse(SOURCES[module].read_text(encoding="utf-8"))))
 
 
 def is_for_types(node: ast.AST) -> bool:

@@ -25,7 +25,7 @@ def renderer(room_map):
     return create_renderer(room_map)
 
 
-@pytest.fixture(scope="module", params=["sift", "xfeat"])
+@pytest.fixture(scope="module", params=["sift", pytest.param("xfeat", marks=pytest.mark.slow)])
 def localizer(renderer, request):
     return Localizer(renderer, create_matcher(request.param))
 

@@ -115,6 +115,7 @@ def test_what_is_no_similarity_is_refused(scale, rotation, translation, match):
 # Rendering
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make_renderer", [create_renderer, ReferenceRenderer])
 @pytest.mark.parametrize("antialiased", [False, True])
 @settings(max_examples=8, deadline=None)

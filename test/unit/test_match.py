@@ -28,12 +28,12 @@ TOLERANCES = {
 }
 
 
-# The others are tested too, but not by `make unit`.
-QUICK = ("sift", "xfeat")
+# The networks are tested too, but not by `make unit`.
+QUICK = ("sift",)
 
 
 def each(names: Iterable[str]) -> list:
-    """Return parameters that are slow but for QUICK ones."""
+    """Return the parameters for matchers, which are slow but for QUICK ones."""
     return [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in names]
 
 
@@ -144,6 +144,7 @@ def test_superpoint_matches_are_those_of_the_whole_model(create, monkeypatch, na
         assert len(matches) >= least
 
 
+@pytest.mark.slow
 def test_loftr_matches_cells_of_eight_pixels_in_colmap_s_convention(create) -> None:
     matcher = create("loftr")
     # Untrained it is confident of nothing.

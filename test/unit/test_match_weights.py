@@ -53,6 +53,7 @@ def test_missing_weights_are_an_error_that_names_all_four_places(
         create_matcher(name)
 
 
+@pytest.mark.slow
 def test_missing_weights_of_loftr_are_an_error_that_names_its_three_places(no_cache) -> None:
     with pytest.raises(WeightsError, match=r"(?s)matcher\.weights.*loftr_outdoor\.ckpt does not exist.*download"):
         create_matcher("loftr")
@@ -114,6 +115,7 @@ def test_bad_weight_files_are_a_clear_error(tmp_path, name, content) -> None:
         create_matcher(name, weights=str(path))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("content", [{"layer": torch.zeros(3)}, {"state_dict": {}}, [1, 2]], ids=str)
 @pytest.mark.parametrize("name", ["xfeat", "loftr"])
 def test_weights_of_another_network_are_refused(tmp_path, name, content) -> None:
@@ -150,6 +152,7 @@ def test_matchers_that_are_tested_with_random_weights_are_experimental() -> None
     assert {name for name in MATCHERS if MATCHERS[name].experimental} == set(WRITERS)
 
 
+@pytest.mark.slow
 def test_loftr_is_read_from_a_file_or_its_folder(tmp_path) -> None:
     path = write_loftr(tmp_path)
     for weights in (path, tmp_path):

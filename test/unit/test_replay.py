@@ -46,7 +46,13 @@ from gsfeatloc_ros.simulate import write_bag
 from gsfeatloc_ros.simulate.bag_messages import header, make
 from gsfeatloc_ros.tools.replay import main
 
-storages = pytest.mark.parametrize("storage", [StoragePlugin.MCAP, StoragePlugin.SQLITE3], ids=["mcap", "sqlite3"])
+storages = pytest.mark.parametrize(
+    "storage",
+    [
+        pytest.param(StoragePlugin.MCAP, id="mcap"),
+        pytest.param(StoragePlugin.SQLITE3, id="sqlite3", marks=pytest.mark.slow),
+    ],
+)
 # A slow, shared machine is no reason to fail.
 unhurried = settings(deadline=None, max_examples=25, suppress_health_check=list(HealthCheck))
 
@@ -140,6 +146,7 @@ def test_other_types_of_messages(room_camera, room_photos, room_map_file, tmp_pa
     assert "truth known for 1 of the 2 answers" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_the_command_needs_no_ros(room_camera, room_photos, room_map_file, tmp_path):
     write_bag(tmp_path / "bag", room_camera, room_photos[:1])
     hide = "import sys; sys.modules.update(dict.fromkeys(['rclpy', 'sensor_msgs', 'geometry_msgs']));"

@@ -21,7 +21,11 @@ from gsfeatloc_ros.render import create_renderer
 
 # What both trackers must do; that for GPUs here on torch's CPU.
 both_trackers = pytest.mark.parametrize(
-    "tracker_of", [CornerTracker, partial(GpuCornerTracker, device="cpu")], ids=["for CPUs", "for GPUs"]
+    "tracker_of",
+    [
+        pytest.param(CornerTracker, id="for CPUs"),
+        pytest.param(partial(GpuCornerTracker, device="cpu"), id="for GPUs", marks=pytest.mark.slow),
+    ],
 )
 CAMERA = Camera(160, 120, np.array([[150.0, 0, 79.5], [0, 150.0, 59.5], [0, 0, 1]]))
 

@@ -98,6 +98,7 @@ def test_kernels_stay_beside_their_sources_where_they_can(unwritable_install):
     assert Path(cache_dir(unwritable_install)).parent == beside
 
 
+@pytest.mark.slow
 def test_unwritable_install_keeps_kernels_in_the_users_cache(unwritable_install, tmp_path):
     where = cache_dir(unwritable_install, HOME=str(tmp_path / "home"))
     assert Path(where).parent == tmp_path / "home" / ".cache" / "gsfeatloc_ros" / "numba"
@@ -105,6 +106,7 @@ def test_unwritable_install_keeps_kernels_in_the_users_cache(unwritable_install,
     assert Path(where).parent == tmp_path / "xdg" / "gsfeatloc_ros" / "numba"
 
 
+@pytest.mark.slow
 def test_kernels_are_kept_below_what_the_user_set_and_once_only(unwritable_install, tmp_path):
     where = cache_dir(unwritable_install, NUMBA_CACHE_DIR=str(tmp_path / "mine"))
     assert Path(where).parent == tmp_path / "mine"
@@ -112,6 +114,7 @@ def test_kernels_are_kept_below_what_the_user_set_and_once_only(unwritable_insta
     assert cache_dir(unwritable_install, NUMBA_CACHE_DIR=where) == where
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("source", ["base.py", "lanes.py", "blend.py"])
 def test_kernels_of_other_sources_are_kept_apart(unwritable_install, tmp_path, source):
     where = {"NUMBA_CACHE_DIR": str(tmp_path)}
