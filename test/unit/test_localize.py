@@ -221,10 +221,10 @@ def test_a_blurred_photo_is_compared_with_a_render_blurred_alike(
     assert translation_error(estimate.T_map_camera, photo.T_map_camera) < 0.05
 
 
-@pytest.mark.parametrize("error", [-0.1, -0.05, 0.05, 0.1])
+@pytest.mark.parametrize("error", [-0.05, 0.05])
 def test_a_wrong_focal_length_is_refused_and_told(sift_localizer, room_camera, room_photos, error: float) -> None:
     told = 0
-    for photo in room_photos[:4]:
+    for photo in room_photos[:3]:
         camera = replace(room_camera, K=room_camera.K @ np.diag([1 + error, 1 + error, 1]))
         estimate = sift_localizer.localize(photo.image, camera, photo.T_map_camera_prior)
         assert_no_answer(estimate)
