@@ -151,6 +151,8 @@ class Client(ClientNode):
             self._publishers[topic] = self.node.create_publisher(message_type, topic, 10)
             heard = self.spin_until(lambda: self._publishers[topic].get_subscription_count() > 0)
             assert heard, f"nobody listens to {topic}"
+            # The localizer may take a moment longer to find this one, and would miss what is sent with best effort.
+            self.spin(0.5)
         return self._publishers[topic]
 
     def publish(self, topic: str, message: object) -> None:

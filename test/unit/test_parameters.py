@@ -26,7 +26,7 @@ by_name = pytest.mark.parametrize("parameter", PARAMETERS, ids=lambda parameter:
 
 
 def test_files_are_as_they_are_generated():
-    assert main(["--check"]) == 0
+    assert main(["--check", "--root", str(ROOT)]) == 0
     assert (ROOT / "config" / "localizer.yaml").read_text() == yaml_text()
     assert (ROOT / "docs" / "parameters.md").read_text() == page_text()
 
