@@ -11,7 +11,7 @@ import numpy as np
 
 from gsfeatloc_ros.common.geometry import rotation_error_deg, so3_log, translation_error
 from gsfeatloc_ros.evaluate.dataset import PosedPhoto
-from gsfeatloc_ros.evaluate.protocol import Prior
+from gsfeatloc_ros.evaluate.protocol import PhotoPrior
 from gsfeatloc_ros.localize.estimate import Estimate
 from gsfeatloc_ros.localize.evidence import Evidence
 
@@ -101,7 +101,7 @@ class QueryResult:
         return max(self.rotation_error_deg / MAX_ROTATION_ERROR_DEG, self.translation_error / MAX_TRANSLATION_ERROR)
 
 
-def measure(photo: PosedPhoto, prior: Prior, estimate: Estimate, cost: Cost, scoring: Scoring) -> QueryResult:
+def measure(photo: PosedPhoto, prior: PhotoPrior, estimate: Estimate, cost: Cost, scoring: Scoring) -> QueryResult:
     """Compare an estimate with the true pose of the photo.
 
     Args:

@@ -17,7 +17,7 @@ from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.geometry import make_pose, so3_exp
 from gsfeatloc_ros.evaluate.dataset import PosedPhoto, Scene
 from gsfeatloc_ros.evaluate.metrics import finite_numbers
-from gsfeatloc_ros.evaluate.protocol import PROTOCOLS, Prior
+from gsfeatloc_ros.evaluate.protocol import PROTOCOLS, PhotoPrior
 from gsfeatloc_ros.evaluate.scene import load_scene_renderer
 from gsfeatloc_ros.localize.engine import load_matcher
 from gsfeatloc_ros.localize.estimate import Estimate, Status
@@ -63,7 +63,7 @@ class Negative:
     kind: str
     name: str
     camera: Camera
-    prior: Prior
+    prior: PhotoPrior
     read: Callable[[], np.ndarray]
 
 
@@ -123,7 +123,7 @@ def draw_negatives(scene: Scene, kind: str | Scene, options: NegativeOptions) ->
     return [_flipped(kind, scene, prior) for prior in priors[:limit]]
 
 
-def _flipped(kind: str, scene: Scene, prior: Prior) -> Negative:
+def _flipped(kind: str, scene: Scene, prior: PhotoPrior) -> Negative:
     photo = scene.photos[prior.photo]
     pose = prior.T_map_camera if prior.photo % 2 else photo.T_map_camera
     if kind == "mirror-pose":
@@ -144,7 +144,7 @@ def _opposite(scene: Scene, T_map_camera: np.ndarray) -> np.ndarray:
     return make_pose(turn @ T_map_camera[:3, :3], middle + turn @ (T_map_camera[:3, 3] - middle))
 
 
-def _of_scene(other: Scene, photo: PosedPhoto, scene: Scene, prior: Prior) -> Negative:
+def _of_scene(other: Scene, photo: PosedPhoto, scene: Scene, prior: PhotoPrior) -> Negative:
     camera = scene.photos[prior.photo].camera
 
     def read() -> np.ndarray:
@@ -153,7 +153,7 @@ def _of_scene(other: Scene, photo: PosedPhoto, scene: Scene, prior: Prior) -> Ne
     return Negative(other.name, photo.name, camera, prior, read)
 
 
-def _noise(scene: Scene, prior: Prior, seed: int) -> Negative:
+def _noise(scene: Scene, prior: PhotoPrior, seed: int) -> Negative:
     camera = scene.photos[prior.photo].camera
 
     def make() -> np.ndarray:
@@ -163,7 +163,7 @@ def _noise(scene: Scene, prior: Prior, seed: int) -> Negative:
     return Negative("noise", f"noise {prior.photo}", camera, prior, make)
 
 
-def _black(scene: Scene, prior: Prior) -> Negative:
+def _black(scene: Scene, prior: PhotoPrior) -> Negative:
     camera = scene.photos[prior.photo].camera
     black = partial(np.zeros, (camera.height, camera.width, 3), np.uint8)
     return Negative("black", f"black {prior.photo}", camera, prior, black)

@@ -17,7 +17,7 @@ from typing import Any
 import gsfeatloc_ros
 from gsfeatloc_ros.evaluate.dataset import Scene
 from gsfeatloc_ros.evaluate.metrics import QueryResult
-from gsfeatloc_ros.evaluate.protocol import Prior
+from gsfeatloc_ros.evaluate.protocol import PhotoPrior
 from gsfeatloc_ros.evaluate.run import Run
 
 # Rooms of the package that no result depends on.
@@ -155,7 +155,7 @@ def hash_photos(scene: Scene) -> str:
     return _digest(photos)
 
 
-def fingerprint_of(run: Run, scene: SceneHash, priors: Iterable[Prior]) -> Fingerprint:
+def fingerprint_of(run: Run, scene: SceneHash, priors: Iterable[PhotoPrior]) -> Fingerprint:
     """Return the fingerprint of a run in a scene."""
     return Fingerprint(
         settings=run.settings(),

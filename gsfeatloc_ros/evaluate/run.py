@@ -22,7 +22,7 @@ from gsfeatloc_ros.evaluate.extras import import_extra
 from gsfeatloc_ros.evaluate.metrics import Cost, QueryResult, Scoring, measure
 from gsfeatloc_ros.evaluate.negatives import NEGATIVES, Negative, NegativeOptions, draw_negatives
 from gsfeatloc_ros.evaluate.priors_file import read_priors
-from gsfeatloc_ros.evaluate.protocol import PROTOCOLS, Prior, trajectory_radius
+from gsfeatloc_ros.evaluate.protocol import PROTOCOLS, PhotoPrior, trajectory_radius
 from gsfeatloc_ros.evaluate.published import PublishedLocalizer
 from gsfeatloc_ros.evaluate.scene import load_degraded_renderer, load_scene, load_scene_renderer
 from gsfeatloc_ros.localize.engine import load_matcher
@@ -98,7 +98,7 @@ class Task:
     run: Run
     version: str
     photo: str
-    prior: Prior
+    prior: PhotoPrior
 
     @property
     def drawn_map(self) -> DrawnMap:
@@ -118,7 +118,7 @@ class DrawnMap:
     seed: int = 0
 
 
-def draw_priors(run: Run, scene: Scene) -> list[Prior]:
+def draw_priors(run: Run, scene: Scene) -> list[PhotoPrior]:
     """Draw or read the priors of a run, in the order of the photos.
 
     Raises:

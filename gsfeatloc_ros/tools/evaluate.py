@@ -33,7 +33,7 @@ from gsfeatloc_ros.evaluate.suites import SUITES, Condition
 from gsfeatloc_ros.evaluate.tables import RunResults, describe, over_seeds, query_table, run_summary, run_table
 from gsfeatloc_ros.evaluate.trust import describe_trust, trust_table
 from gsfeatloc_ros.match import DEFAULT_MATCHER, MATCHERS
-from gsfeatloc_ros.tools.options import Settings, add_old_name, localizer_options, number, setting
+from gsfeatloc_ros.tools.options import CollectSettings, add_old_name, localizer_options, number, setting
 
 _NOTHING = "nothing"
 
@@ -174,7 +174,7 @@ def _parser() -> argparse.ArgumentParser:
         "--set",
         type=setting(_list),
         default={},
-        action=Settings,
+        action=CollectSettings,
         metavar="OPTION=LIST",
         help=f"change an option of method default: {', '.join(localizer_options())}",
     )

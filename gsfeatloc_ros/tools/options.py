@@ -20,7 +20,7 @@ _RETIRED = dict.fromkeys(
 )
 
 
-class Settings(argparse.Action):
+class CollectSettings(argparse.Action):
     """Collect pairs of a name and a value in a dictionary."""
 
     def __call__(

@@ -39,7 +39,7 @@ from gsfeatloc_ros.evaluate.metrics import (
 from gsfeatloc_ros.evaluate.priors_file import read_priors
 from gsfeatloc_ros.evaluate.protocol import (
     PROTOCOLS,
-    Prior,
+    PhotoPrior,
     PriorError,
     make_priors,
     paper_bounds,
@@ -390,7 +390,7 @@ PHOTO = PosedPhoto("a.png", Path("a.png"), CAMERA, np.eye(4))
 def result(estimate, prior=None, prior_is_answer=False, milliseconds=10.0):
     """Measured against a camera at the origin, in a trajectory of radius 2."""
     prior = moved(20.0, 1.0) if prior is None else prior
-    return measure(PHOTO, Prior(0, 3, prior), estimate, Cost(milliseconds, 15.0), Scoring(2.0, prior_is_answer))
+    return measure(PHOTO, PhotoPrior(0, 3, prior), estimate, Cost(milliseconds, 15.0), Scoring(2.0, prior_is_answer))
 
 
 def test_errors_of_an_answer():
@@ -467,8 +467,8 @@ def test_an_error_beyond_either_protection_level_is_counted(degrees, sigmas, exc
 
 def test_every_answer_to_a_negative_is_wrong():
     scoring = Scoring(2.0, negative=True)
-    right = measure(PHOTO, Prior(0, 0, np.eye(4)), FAILED, Cost(1.0, 1.0), scoring)
-    wrong = measure(PHOTO, Prior(0, 0, np.eye(4)), answer(0.0, 0.0, np.eye(6)), Cost(1.0, 1.0), scoring)
+    right = measure(PHOTO, PhotoPrior(0, 0, np.eye(4)), FAILED, Cost(1.0, 1.0), scoring)
+    wrong = measure(PHOTO, PhotoPrior(0, 0, np.eye(4)), answer(0.0, 0.0, np.eye(6)), Cost(1.0, 1.0), scoring)
     assert (right.success, right.verdict) == (True, "none")
     assert (wrong.success, wrong.verdict) == (False, "wrong")
     # There is no truth that its covariance could be held against.
