@@ -17,10 +17,6 @@ from gsfeatloc_ros.pose.solve import Correspondences, reprojection_errors
 
 # Cells across and down the photo.
 CELLS = (16, 12)
-# Corners may be off by this many times the median error, up to this many times the reprojection error allowed: in a
-# blurred photo all of them are less certain.
-_TOLERANCE_MEDIANS = 4.0
-_MAX_TOLERANCE = 2.0
 # Pictures are compared at this focal length in pixels, or their own if that is shorter: finer detail splats do not
 # draw, and what is compared is the same in a crop or a photo of another size.
 _FOCAL_LENGTH = 300.0
@@ -70,12 +66,13 @@ class Comparison:
         return float(changed[compared].mean()) if compared.any() else float("nan")
 
 
-def compare(query: Query, view: MatchedView) -> Comparison:
-    """Compare a photo with the view from the estimate, which has a solution."""
+def compare(query: Query, view: MatchedView, tolerance: float) -> Comparison:
+    """Compare a photo with the view from the estimate, which has a solution.
+
+    Corners agree with it that are off by at most `tolerance` pixels.
+    """
     assert view.solution is not None
     options, camera, pose = query.components.options, query.photo.camera, view.solution.T_map_camera
-    max_error = options.pose.max_reprojection_error
-    tolerance = np.clip(_TOLERANCE_MEDIANS * np.median(view.solution.errors), max_error, _MAX_TOLERANCE * max_error)
     with query.clock.stage("track"):
         back = query.tracker.track_back(view.image)
     lifted = lift(view.render, camera, view.pose, back.b, options.lift)

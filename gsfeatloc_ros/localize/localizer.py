@@ -43,6 +43,8 @@ from gsfeatloc_ros.render.base import Renderer
 
 # A render nearer to the photo than this many pixels is at the estimate.
 _MAX_SETTLED_OFFSET = 0.5
+# With a blur of this extent, in pixels, corners may be off by twice the reprojection error allowed.
+_BLUR_THAT_DOUBLES_ERRORS = 25.0
 # Matches farther off than this many pixels say nothing of the camera.
 _MAX_CAMERA_ERROR = 20.0
 # Views nearer to each other than this share of the default deviations of a prior show the same.
@@ -209,7 +211,9 @@ class Localizer:
         options, camera = self._components.options, query.photo.camera
         if view.solution is None:
             return _Candidate(view, evidence, None, verdict(evidence, options.limits))
-        comparison = compare(query, view)
+        # In a blurred photo all corners are less certain.
+        blurred = min(evidence.blur_px / _BLUR_THAT_DOUBLES_ERRORS, 1.0)
+        comparison = compare(query, view, (1.0 + blurred) * options.pose.max_reprojection_error)
         with query.clock.stage("verify"):
             pose = view.solution.T_map_camera
             fit = fit_camera(camera, pose, _near(view), options.pose)

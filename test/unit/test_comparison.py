@@ -27,7 +27,7 @@ def compared(components, image: np.ndarray, camera: Camera, pose: np.ndarray) ->
     """A photo compared with the map seen from a pose."""
     query = Query(components, Photo.undistorted(image, camera, 640), StageClock())
     view = query.track(pose)
-    return compare(query, view), query, view
+    return compare(query, view, 3.0), query, view
 
 
 def covered(image: np.ndarray) -> np.ndarray:
@@ -88,7 +88,7 @@ def test_a_blank_photo_has_nothing_to_compare(components, room_camera, room_phot
     blank = replace(query.photo, image=np.full_like(query.photo.image, 128))
     view = replace(view, image=np.full_like(query.photo.image, 128))
     assert not changed_mask(blank, view).any()
-    comparison = compare(replace(query, photo=blank), view)
+    comparison = compare(replace(query, photo=blank), view, 3.0)
     assert np.isnan(comparison.correlation).all()
     assert np.isnan(comparison.explained_correlation(0.5))
     assert np.isnan(comparison.changed_share())
