@@ -28,10 +28,13 @@ _RENAMED = {
     "reprojection_error": "reprojection_error_px",
     "min_agreement": "min_correlation",
 }
-# What tells a query from the others; in files of one kind, not all are there.
-_IDENTITY = ("scene", "protocol", "method", "matcher", "sigma", "seed", "options", "ablation", "corruption", "kind")
+# What tells a query from the others; in files of one kind, not all are there. What is not there is as if it were "".
+_IDENTITY = (
+    *("scene", "protocol", "method", "matcher", "sigma", "seed", "options"),
+    *("ablation", "corruption", "degradation", "negative", "kind"),
+)
 _QUERY_IDENTITY = ("photo", "step", "bag_time")
-_TIMES = ("milliseconds", "stage_milliseconds", "cpu_seconds", "ms")
+_TIMES = ("milliseconds", "cpu_milliseconds", "stage_milliseconds", "cpu_seconds", "ms")
 # Queries that differ are listed up to this number.
 _MAX_LISTED = 50
 
@@ -71,7 +74,8 @@ def read_queries(path: Path) -> dict[Identity, Query]:
     """
     queries: dict[Identity, Query] = {}
     for row in _rows(path):
-        identity = tuple((name, _bits(row[name])) for name in (*_IDENTITY, *_QUERY_IDENTITY) if name in row)
+        names = [name for name in (*_IDENTITY, *_QUERY_IDENTITY) if row.get(name, "") != ""]
+        identity = tuple((name, _bits(row[name])) for name in names)
         if identity in queries:
             raise ValueError(f"{path}: holds {_words(identity)} twice")
         queries[identity] = {name: value for name, value in row.items() if name not in (*_IDENTITY, *_TIMES)}

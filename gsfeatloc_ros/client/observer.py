@@ -95,7 +95,7 @@ class Call:
 
 
 @dataclass
-class Record:
+class SoakRecord:
     """All that was seen.
 
     Attributes:
@@ -133,7 +133,7 @@ class Observer(ClientNode):
 
     def __init__(self, photos_file: Path, size: tuple[int, int]) -> None:
         super().__init__("observer")
-        self.record = Record()
+        self.record = SoakRecord()
         self.node.create_subscription(PoseStamped, "ground_truth", self._on_truth, 100)
         self.node.create_subscription(PoseWithCovarianceStamped, "pose", self._on_pose, LATCHED)
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 100)

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from gsfeatloc_ros.client.observer import Call, Record, Sample
+from gsfeatloc_ros.client.observer import Call, Sample, SoakRecord
 from gsfeatloc_ros.client.score import MAX_ROTATION_ERROR_DEG, MAX_TRANSLATION_ERROR, pose_error
 
 # Seconds after which memory is not to grow any more.
@@ -56,7 +56,7 @@ def summarize_calls(calls: list[Call], typical: float) -> dict[str, float]:
     return counts | {name: round(float(value), 2) for name, value in figures.items()}
 
 
-def summarize(record: Record, seconds: float) -> dict[str, Any]:
+def summarize(record: SoakRecord, seconds: float) -> dict[str, Any]:
     """Return the figures of a record, and which targets it reaches; `seconds` is how long the stream was to last."""
     of_stream = [pose_error(record.sent[stamp], pose) for stamp, pose in record.answers.items()]
     degrees, metres = np.array(of_stream + record.errors).T

@@ -80,6 +80,11 @@ class Camera:
         camera = self.limited(max_width)
         return cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA), camera
 
+    def enlarged(self, focal_length: float, max_side: int) -> Camera:
+        """Return the camera of the image enlarged, in proportion, to a focal length, neither side beyond `max_side`."""
+        scale = min(focal_length / self.K[0, 0], max_side / max(self.width, self.height))
+        return self.scaled(round(scale * self.width), max(1, round(scale * self.height))) if scale > 1 else self
+
     @property
     def distorted(self) -> bool:
         """Whether the lens is anything but a pinhole; a fisheye without coefficients is."""

@@ -9,6 +9,10 @@ import numpy as np
 
 from gsfeatloc_ros.common.camera import Camera
 
+# Photos of a shorter focal length, in pixels, are enlarged, if by at least this factor.
+_MIN_FOCAL_LENGTH = 500.0
+_MIN_ENLARGEMENT = 1.25
+
 
 @dataclass(frozen=True, eq=False)
 class Photo:
@@ -26,8 +30,15 @@ class Photo:
 
     @staticmethod
     def undistorted(image: np.ndarray, camera: Camera, max_width: int) -> Photo:
-        """Undistort the image (H, W, 3) uint8 RGB that `camera` observed, at most `max_width` pixels wide."""
+        """Undistort the image (H, W, 3) uint8 RGB that `camera` observed, at most `max_width` pixels wide.
+
+        A small one is enlarged: what pixels are compared by is meant for the detail of usual photos.
+        """
         image, camera = camera.limit(image, max_width)
+        larger = camera.enlarged(_MIN_FOCAL_LENGTH, max_width)
+        if larger.width >= _MIN_ENLARGEMENT * camera.width:
+            image = cv2.resize(image, (larger.width, larger.height), interpolation=cv2.INTER_CUBIC)
+            camera = larger
         seen = camera.undistort_image(np.full(image.shape[:2], 255, np.uint8)) == 255
         return Photo(camera.undistort_image(image), seen, camera.pinhole())
 

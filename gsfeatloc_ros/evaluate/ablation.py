@@ -61,6 +61,10 @@ class FeatureTracker:
         """Find the photo's features in a render (H, W, 3) uint8 RGB."""
         return self._matcher.match(self.corners, self._matcher.features(image))
 
+    def track_back(self, image: Array) -> Matches:
+        """Find the features of a render in the photo."""
+        return self._matcher.match(self._matcher.features(image), self.corners).swapped()
+
 
 class WholePixelTracker:
     """Track corners and round where they are in the render to whole pixels."""
@@ -72,6 +76,11 @@ class WholePixelTracker:
     def track(self, image: Array) -> Matches:
         """Find the photo's corners in a render (H, W, 3) uint8 RGB."""
         matches = self._tracker.track(image)
+        return replace(matches, b=np.round(matches.b))
+
+    def track_back(self, image: Array) -> Matches:
+        """Find the corners of a render in the photo, in whole pixels of the render."""
+        matches = self._tracker.track_back(image)
         return replace(matches, b=np.round(matches.b))
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from gsfeatloc_ros.common.geometry import rotation_error_deg, so3_log, translation_error
 from gsfeatloc_ros.evaluate.dataset import PosedPhoto
-from gsfeatloc_ros.evaluate.protocol import Prior
+from gsfeatloc_ros.evaluate.protocol import PhotoPrior
 from gsfeatloc_ros.localize.estimate import Estimate
 from gsfeatloc_ros.localize.evidence import Evidence
 
@@ -28,10 +28,20 @@ class Scoring:
     Attributes:
         radius: of the scene's camera trajectory in map units, which translation errors are divided by.
         prior_is_answer: whether a prior that was good enough makes a failed query a success, as in the publication.
+        negative: whether the photo is not of the scene, so that every answer is wrong.
     """
 
     radius: float
     prior_is_answer: bool = False
+    negative: bool = False
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Time of a localization in milliseconds: on the clock, and of all of the process's threads."""
+
+    milliseconds: float
+    cpu_milliseconds: float
 
 
 @dataclass(frozen=True)
@@ -47,14 +57,17 @@ class QueryResult:
         step: number of the prior among the photo's.
         prior_rotation_error_deg, prior_translation_error: errors of the prior.
         answered: whether the method gave a pose of its own.
-        success: whether the answer is within 5 degrees and 0.05.
-        rotation_error_deg, translation_error: errors of the answer.
+        success: whether the answer is within 5 degrees and 0.05; of a negative, that there is none.
+        rotation_error_deg, translation_error: errors of the answer. Of a negative, from the photo that it stands for:
+            they say nothing.
         status, reason: as in Estimate.
         evidence: of the Estimate, by name; None for what could not be measured.
         milliseconds: wall time of the call.
+        cpu_milliseconds: CPU time of the call.
         stage_milliseconds: wall time of each stage, with "total", as in Estimate.
         nees: normalised estimation error squared of the answer, per degree of freedom; None without a covariance.
         in_ellipsoid: whether the ellipsoid that should hold the truth with 50, 90 and 95 % does; None without one.
+        protection_exceeded: whether the answer is farther off than its protection level says; None without one.
     """
 
     photo: str
@@ -69,9 +82,11 @@ class QueryResult:
     reason: str
     evidence: dict[str, int | float | None]
     milliseconds: float
+    cpu_milliseconds: float
     stage_milliseconds: dict[str, float]
     nees: float | None
     in_ellipsoid: dict[str, bool] | None
+    protection_exceeded: bool | None
 
     @property
     def verdict(self) -> str:
@@ -86,14 +101,14 @@ class QueryResult:
         return max(self.rotation_error_deg / MAX_ROTATION_ERROR_DEG, self.translation_error / MAX_TRANSLATION_ERROR)
 
 
-def measure(photo: PosedPhoto, prior: Prior, estimate: Estimate, milliseconds: float, scoring: Scoring) -> QueryResult:
+def measure(photo: PosedPhoto, prior: PhotoPrior, estimate: Estimate, cost: Cost, scoring: Scoring) -> QueryResult:
     """Compare an estimate with the true pose of the photo.
 
     Args:
         photo: with its true pose.
         prior: that the localizer was given.
         estimate: the localizer's.
-        milliseconds: wall time of the call.
+        cost: of the call.
         scoring: how it is scored.
     """
     truth = photo.T_map_camera
@@ -102,28 +117,40 @@ def measure(photo: PosedPhoto, prior: Prior, estimate: Estimate, milliseconds: f
     rotation = rotation_error_deg(truth, answer)
     translation = translation_error(truth, answer) / scoring.radius
     close = rotation < MAX_ROTATION_ERROR_DEG and translation < MAX_TRANSLATION_ERROR
-    nees = in_ellipsoid = None
-    if estimate.covariance is not None:
+    nees = in_ellipsoid = exceeded = None
+    if estimate.covariance is not None and not scoring.negative:
         nees = normalised_error(answer, estimate.covariance, truth)
         probability = chi_square_cdf(np.array(6 * nees))
         in_ellipsoid = {str(percent): bool(probability <= percent / 100) for percent in ELLIPSOIDS}
+        exceeded = _exceeds_protection(truth, estimate)
     return QueryResult(
         photo=photo.name,
         step=prior.step,
         prior_rotation_error_deg=rotation_error_deg(truth, prior.T_map_camera),
         prior_translation_error=translation_error(truth, prior.T_map_camera) / scoring.radius,
         answered=answered,
-        success=close and (answered or scoring.prior_is_answer),
+        success=not answered if scoring.negative else close and (answered or scoring.prior_is_answer),
         rotation_error_deg=rotation,
         translation_error=translation,
         status=estimate.status.value,
         reason=estimate.reason,
         evidence=finite_numbers(estimate.evidence),
-        milliseconds=milliseconds,
+        milliseconds=cost.milliseconds,
+        cpu_milliseconds=cost.cpu_milliseconds,
         stage_milliseconds=dict(estimate.milliseconds),
         nees=nees,
         in_ellipsoid=in_ellipsoid,
+        protection_exceeded=exceeded,
     )
+
+
+def _exceeds_protection(truth: np.ndarray, estimate: Estimate) -> bool | None:
+    """Return whether an answer is farther from the true pose (4, 4) than its protection level; None without one."""
+    level = estimate.protection
+    if level is None or estimate.T_map_camera is None:
+        return None
+    rotation = np.radians(rotation_error_deg(truth, estimate.T_map_camera))
+    return bool(translation_error(truth, estimate.T_map_camera) > level.radius or rotation > level.angle)
 
 
 def finite_numbers(evidence: Evidence) -> dict[str, int | float | None]:
@@ -189,9 +216,11 @@ def summarize(results: Sequence[QueryResult]) -> dict[str, Any]:
         "answered": sum(result.answered for result in results),
         "wrong_answers": sum(result.verdict == "wrong" for result in results),
         "milliseconds": {"median": float(np.median(milliseconds)), "p95": float(np.percentile(milliseconds, 95))},
+        "cpu_milliseconds": {"median": float(np.median([result.cpu_milliseconds for result in results]))},
         "nees_mean": float(nees.mean()) if len(nees) else None,
         "nees_median": float(np.median(nees)) if len(nees) else None,
         "coverage": coverage,
+        "protection_exceeded": sum(bool(result.protection_exceeded) for result in results),
         "per_query": [asdict(result) for result in results],
     }
 

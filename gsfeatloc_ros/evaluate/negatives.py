@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import time
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from statistics import median
 from typing import Any
 
@@ -12,9 +14,10 @@ import cv2
 import numpy as np
 
 from gsfeatloc_ros.common.camera import Camera
-from gsfeatloc_ros.evaluate.dataset import Scene
+from gsfeatloc_ros.common.geometry import make_pose, so3_exp
+from gsfeatloc_ros.evaluate.dataset import PosedPhoto, Scene
 from gsfeatloc_ros.evaluate.metrics import finite_numbers
-from gsfeatloc_ros.evaluate.protocol import PROTOCOLS, Prior
+from gsfeatloc_ros.evaluate.protocol import PROTOCOLS, PhotoPrior
 from gsfeatloc_ros.evaluate.scene import load_scene_renderer
 from gsfeatloc_ros.localize.engine import load_matcher
 from gsfeatloc_ros.localize.estimate import Estimate, Status
@@ -25,6 +28,8 @@ from gsfeatloc_ros.localize.settings import MatcherSettings, RendererSettings
 # Of those that have no photo behind them a few are enough.
 _NOISE_PHOTOS = 4
 _BLACK_PHOTOS = 2
+NEGATIVES = ("mirrored", "upside-down", "mirror-pose", "noise", "black")
+"""Kinds that need no other scene."""
 
 
 @dataclass(frozen=True)
@@ -47,18 +52,19 @@ class Negative:
     """A photo that the camera of a scene cannot have taken there, and where it is claimed to be from.
 
     Attributes:
-        kind: "mirrored", "upside-down", "noise", "black" or the name of the scene that it is of.
+        kind: one of NEGATIVES, or the name of the scene that it is of.
         name: of the photo.
-        image: (H, W, 3) uint8 RGB, of the size of `camera`.
-        camera: of the photo of the scene that it stands for.
+        camera: of the photo of the scene that it stands for, `prior.photo`.
         prior: the pose that it is looked for at.
+        read: reads or makes the image: (H, W, 3) uint8 RGB, of the size of `camera`; raises ValueError as
+            Scene.read_photo.
     """
 
     kind: str
     name: str
-    image: np.ndarray
     camera: Camera
-    prior: Prior
+    prior: PhotoPrior
+    read: Callable[[], np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -94,38 +100,73 @@ class NegativeResult:
         }
 
 
-def draw_negatives(scene: Scene, others: Sequence[Scene], options: NegativeOptions) -> Iterator[Negative]:
-    """Draw photos that are not of `scene`, one at a time.
+def draw_negatives(scene: Scene, kind: str | Scene, options: NegativeOptions) -> list[Negative]:
+    """Draw photos that are not of `scene`; the images are read when they are asked for.
 
-    They are its own photos, mirrored and upside down, the photos of other scenes, noise and black. Priors are those of
-    protocol `paper`; of every second of the scene's own photos the prior is the pose where it was taken, from which its
-    mirror image looks the most like the map.
+    Priors are those of protocol `paper`. Of every second of the scene's own photos, mirrored or upside down, the prior
+    is the pose where it was taken, from which its mirror image looks the most like the map; at a mirror pose the photo
+    is mirrored and the prior on the opposite side of the scene.
 
     Args:
         scene: where they are looked for.
-        others: what the others are of.
+        kind: one of NEGATIVES, or another scene for its photos.
         options: how many, and their priors.
     """
+    priors = PROTOCOLS["paper"](scene, options.sigma, options.seed)
     limit = options.limit or None
-    priors = PROTOCOLS["paper"](scene, options.sigma, options.seed)[:limit]
-    rng = np.random.default_rng(options.seed)
-    for kind, axis in (("mirrored", 1), ("upside-down", 0)):
-        for index, prior in enumerate(priors):
-            photo = scene.photos[index]
-            image = np.ascontiguousarray(np.flip(scene.read_photo(photo), axis=axis))
-            pose = prior.T_map_camera if index % 2 else photo.T_map_camera
-            yield Negative(kind, photo.name, image, photo.camera, Prior(index, 0, pose, prior.covariance))
-    for other in others:
-        for number, photo in enumerate(other.photos[:limit]):
-            prior = priors[number % len(priors)]
-            camera = scene.photos[prior.photo].camera
-            image = cv2.resize(other.read_photo(photo), (camera.width, camera.height), interpolation=cv2.INTER_AREA)
-            yield Negative(other.name, photo.name, image, camera, prior)
-    for kind, count, brightest in (("noise", _NOISE_PHOTOS, 256), ("black", _BLACK_PHOTOS, 1)):
-        for index, prior in enumerate(priors[:count]):
-            camera = scene.photos[index].camera
-            image = rng.integers(brightest, size=(camera.height, camera.width, 3), dtype=np.uint8)
-            yield Negative(kind, f"{kind} {index}", image, camera, prior)
+    if isinstance(kind, Scene):
+        return [_of_scene(kind, photo, scene, priors[i % len(priors)]) for i, photo in enumerate(kind.photos[:limit])]
+    if kind == "noise":
+        return [_noise(scene, prior, options.seed) for prior in priors[:limit][:_NOISE_PHOTOS]]
+    if kind == "black":
+        return [_black(scene, prior) for prior in priors[:limit][:_BLACK_PHOTOS]]
+    return [_flipped(kind, scene, prior) for prior in priors[:limit]]
+
+
+def _flipped(kind: str, scene: Scene, prior: PhotoPrior) -> Negative:
+    photo = scene.photos[prior.photo]
+    pose = prior.T_map_camera if prior.photo % 2 else photo.T_map_camera
+    if kind == "mirror-pose":
+        pose = _opposite(scene, photo.T_map_camera)
+    axis = 0 if kind == "upside-down" else 1
+
+    def read() -> np.ndarray:
+        return np.ascontiguousarray(np.flip(scene.read_photo(photo), axis=axis))
+
+    return Negative(kind, photo.name, photo.camera, replace(prior, T_map_camera=pose), read)
+
+
+def _opposite(scene: Scene, T_map_camera: np.ndarray) -> np.ndarray:
+    """Return a pose (4, 4) turned by half a turn about the vertical through the middle of the trajectory."""
+    middle = scene.trajectory[:, :3, 3].mean(axis=0)
+    down = scene.trajectory[:, :3, 1].mean(axis=0)
+    turn = so3_exp(np.pi * down / np.linalg.norm(down))
+    return make_pose(turn @ T_map_camera[:3, :3], middle + turn @ (T_map_camera[:3, 3] - middle))
+
+
+def _of_scene(other: Scene, photo: PosedPhoto, scene: Scene, prior: PhotoPrior) -> Negative:
+    camera = scene.photos[prior.photo].camera
+
+    def read() -> np.ndarray:
+        return cv2.resize(other.read_photo(photo), (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+
+    return Negative(other.name, photo.name, camera, prior, read)
+
+
+def _noise(scene: Scene, prior: PhotoPrior, seed: int) -> Negative:
+    camera = scene.photos[prior.photo].camera
+
+    def make() -> np.ndarray:
+        rng = np.random.default_rng([seed, prior.photo])
+        return rng.integers(256, size=(camera.height, camera.width, 3), dtype=np.uint8)
+
+    return Negative("noise", f"noise {prior.photo}", camera, prior, make)
+
+
+def _black(scene: Scene, prior: PhotoPrior) -> Negative:
+    camera = scene.photos[prior.photo].camera
+    black = partial(np.zeros, (camera.height, camera.width, 3), np.uint8)
+    return Negative("black", f"black {prior.photo}", camera, prior, black)
 
 
 def localize_negatives(
@@ -142,10 +183,13 @@ def localize_negatives(
             matcher = load_matcher(MatcherSettings(name=matcher_name), renderer.device)
             localizer = Localizer(renderer, matcher, LocalizerOptions(seed=options.seed))
             others = [other for other in scenes if other is not scene]
-            for negative in draw_negatives(scene, others, options):
+            kinds: list[str | Scene] = [*NEGATIVES, *others]
+            drawn = [draw_negatives(scene, kind, options) for kind in kinds]
+            for negative in itertools.chain.from_iterable(drawn):
+                image = negative.read()
                 start = time.process_time()
                 estimate = localizer.localize(
-                    negative.image, negative.camera, negative.prior.T_map_camera, negative.prior.covariance
+                    image, negative.camera, negative.prior.T_map_camera, negative.prior.covariance
                 )
                 seconds = time.process_time() - start
                 yield NegativeResult(scene.name, matcher_name, negative.kind, negative.name, estimate, seconds)

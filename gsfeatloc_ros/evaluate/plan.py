@@ -4,13 +4,23 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
+from gsfeatloc_ros.evaluate.dataset import Scene
 from gsfeatloc_ros.evaluate.metrics import QueryResult
-from gsfeatloc_ros.evaluate.record import Fingerprint, Record, fingerprint_of, hash_scene
-from gsfeatloc_ros.evaluate.run import PRIORS_FILE, Run, Task, draw_priors, localize_all
+from gsfeatloc_ros.evaluate.record import Fingerprint, Record, SceneHash, fingerprint_of, hash_photos, hash_scene
+from gsfeatloc_ros.evaluate.run import (
+    PRIORS_FILE,
+    Run,
+    Task,
+    draw_priors,
+    load_negative_scene,
+    localize_all,
+    run_negatives,
+)
 from gsfeatloc_ros.evaluate.scene import load_scene
+from gsfeatloc_ros.evaluate.suites import Condition
 from gsfeatloc_ros.evaluate.tables import RunResults
 
 
@@ -20,14 +30,15 @@ class Combinations:
 
     Attributes:
         scenes: folders with their maps; None for the map in the folder.
+        conditions: what is done to the photos, priors and maps.
         priors_file: for the protocol PRIORS_FILE.
         max_width: as in Run, one for all.
         options: values by the name of a parameter of LocalizerOptions.
-        protocols, methods, matchers, sigmas, seeds, ablations, corruptions: as in Run.
+        methods, matchers, sigmas, seeds, ablations: as in Run.
     """
 
     scenes: Sequence[tuple[Path, Path | None]]
-    protocols: Sequence[str]
+    conditions: Sequence[Condition]
     priors_file: Path | None
     methods: Sequence[str]
     matchers: Sequence[str]
@@ -36,17 +47,17 @@ class Combinations:
     max_width: int
     options: dict[str, list[float]]
     ablations: Sequence[str] = ("",)
-    corruptions: Sequence[str] = ("",)
 
     def runs(self) -> list[Run]:
         """Return all combinations, those next to each other that need the same map and matcher."""
         values = [[(name, value) for value in values] for name, values in self.options.items()]
+        folders = [scene for scene, _ in self.scenes]
         return [
             Run(
                 scene=scene,
                 map_path=map_path,
-                protocol=protocol,
-                priors_file=self.priors_file if protocol == PRIORS_FILE else None,
+                protocol=condition.protocol,
+                priors_file=self.priors_file if condition.protocol == PRIORS_FILE else None,
                 method=method,
                 matcher=matcher,
                 sigma=sigma,
@@ -54,16 +65,19 @@ class Combinations:
                 max_width=self.max_width,
                 options=options,
                 ablation=ablation,
-                corruption=corruption,
+                corruption=condition.corruption,
+                degradation=condition.degradation,
+                negative=negative,
             )
             for scene, map_path in self.scenes
-            for matcher, method, protocol, sigma, seed in itertools.product(
-                self.matchers, self.methods, self.protocols, self.sigmas, self.seeds
-            )
+            for degradation in dict.fromkeys(condition.degradation for condition in self.conditions)
+            for matcher, method, sigma, seed in itertools.product(self.matchers, self.methods, self.sigmas, self.seeds)
             # The published recipe has no options and is taken whole.
             for options in (itertools.product(*values) if method == "default" else [()])
             for ablation in (self.ablations if method == "default" else [""])
-            for corruption in self.corruptions
+            for condition in self.conditions
+            if condition.degradation == degradation
+            for negative in condition.negatives(scene, folders)
         ]
 
 
@@ -127,19 +141,37 @@ def _plans(runs: Sequence[Run], limit: int, record: Record) -> Iterator[_Plan]:
     """Yield the tasks of all runs with what the record has of them."""
     for (folder, map_path), group in itertools.groupby(runs, key=lambda run: (run.scene, run.map_path)):
         scene = load_scene(folder, map_path)
-        scene_hash = hash_scene(scene)
-        photos = limit or len(scene.photos)
+        hashes = _Hashes(hash_scene(scene))
         for run in group:
-            priors = draw_priors(run, scene)
-            fingerprint = fingerprint_of(run, scene_hash, priors)
-            tasks = [
-                Task(run, fingerprint.version, scene.photos[prior.photo].name, prior)
-                for prior in priors
-                if prior.photo < photos
-            ]
-            if not tasks:
-                raise ValueError(f"{run.priors_file}: has no prior of the first {photos} photos")
+            other = load_negative_scene(run)
+            if run.negative:
+                negatives = run_negatives(run, scene, other)
+                every = [(negative.name, negative.prior) for negative in negatives]
+                chosen = every[: limit or None]
+            else:
+                every = [(scene.photos[prior.photo].name, prior) for prior in draw_priors(run, scene)]
+                chosen = [(name, prior) for name, prior in every if not limit or prior.photo < limit]
+            if not chosen:
+                raise ValueError(f"{run.priors_file}: has no prior of the first {limit or len(scene.photos)} photos")
+            fingerprint = fingerprint_of(run, hashes.together(other), [prior for _, prior in every])
+            tasks = [Task(run, fingerprint.version, name, prior) for name, prior in chosen]
             yield _Plan(run, fingerprint, tasks, record.done(fingerprint))
+
+
+@dataclass(frozen=True)
+class _Hashes:
+    """Hashes of a scene, and of the others whose photos are looked for in it, by their names."""
+
+    scene: SceneHash
+    others: dict[str, str] = field(default_factory=dict)
+
+    def together(self, other: Scene | None) -> SceneHash:
+        """Return the hashes of the scene with the photos of another, if any."""
+        if other is None:
+            return self.scene
+        if other.name not in self.others:
+            self.others[other.name] = hash_photos(other)
+        return SceneHash(self.scene.map, self.scene.photos + self.others[other.name])
 
 
 def _query(task: Task) -> tuple[str, int]:

@@ -16,12 +16,12 @@ import numpy as np
 
 from gsfeatloc_ros.common.geometry import make_pose, matrix_from_quaternion
 from gsfeatloc_ros.evaluate.dataset import Scene
-from gsfeatloc_ros.evaluate.protocol import Prior
+from gsfeatloc_ros.evaluate.protocol import PhotoPrior
 
 _NUMBERS = ("tx", "ty", "tz", "qx", "qy", "qz", "qw")
 
 
-def read_priors(path: Path, scene: Scene) -> list[Prior]:
+def read_priors(path: Path, scene: Scene) -> list[PhotoPrior]:
     """Read the priors of a scene's photos, in the order of the photos; lines of other photos are passed over.
 
     A photo may have several priors, or none: it is not localized then.
@@ -46,7 +46,7 @@ def read_priors(path: Path, scene: Scene) -> list[Prior]:
     seen: Counter[int] = Counter()
     priors = []
     for index, pose in sorted(poses, key=lambda pair: pair[0]):
-        priors.append(Prior(index, seen[index], pose))
+        priors.append(PhotoPrior(index, seen[index], pose))
         seen[index] += 1
     return priors
 

@@ -18,10 +18,12 @@ _SWEEP_STEPS = 10
 _CHEN_REPETITIONS = 5
 _CHEN_ROTATION_DEG = (10.0, 40.0)
 _CHEN_TRANSLATION = (0.0, 0.2)  # of the trajectory's radius
+_NEAR_MISS_ROTATION_DEG = (5.0, 20.0)
+_NEAR_MISS_TRANSLATION = (0.1, 0.5)  # of the trajectory's radius
 
 
 @dataclass(frozen=True, eq=False)
-class Prior:
+class PhotoPrior:
     """A wrong pose from which a photo is localized.
 
     Attributes:
@@ -92,62 +94,85 @@ def make_priors(scene: Scene, error: PriorError, seed: int) -> list[np.ndarray]:
     ]
 
 
-def paper(scene: Scene, sigma: float, seed: int) -> list[Prior]:
+def paper(scene: Scene, sigma: float, seed: int) -> list[PhotoPrior]:
     """Draw priors as in the published evaluation of GSFeatLoc: one normally distributed, see `paper_prior_error`."""
     error = paper_prior_error(scene, sigma)
-    return [Prior(index, 0, pose, error.covariance) for index, pose in enumerate(make_priors(scene, error, seed))]
+    return [PhotoPrior(index, 0, pose, error.covariance) for index, pose in enumerate(make_priors(scene, error, seed))]
 
 
-def chen(scene: Scene, sigma: float, seed: int) -> list[Prior]:
+def chen(scene: Scene, sigma: float, seed: int) -> list[PhotoPrior]:
     """Draw five priors a photo, moved by 0 to 0.2 radii and turned by 10 to 40 degrees, in random directions.
 
     Distances and angles are uniformly distributed; `sigma` scales them.
     """
-    radius = trajectory_radius(scene)
-    covariance = PriorError(
-        sigma * np.radians(_root_mean_square(*_CHEN_ROTATION_DEG)),
-        sigma * radius * _root_mean_square(*_CHEN_TRANSLATION),
-    ).covariance
-    priors = []
-    for index, photo in enumerate(scene.photos):
-        for repetition in range(_CHEN_REPETITIONS):
-            rng = np.random.default_rng([seed, index, repetition])
-            translation = sigma * radius * rng.uniform(*_CHEN_TRANSLATION) * random_unit_vector(rng)
-            rotation = sigma * np.radians(rng.uniform(*_CHEN_ROTATION_DEG)) * random_unit_vector(rng)
-            priors.append(Prior(index, repetition, _moved(photo.T_map_camera, rotation, translation), covariance))
-    return priors
+    return _uniform(scene, sigma, seed, _Ranges(_CHEN_ROTATION_DEG, _CHEN_TRANSLATION, _CHEN_REPETITIONS))
 
 
-def sweep_rotation(scene: Scene, sigma: float, seed: int) -> list[Prior]:
+def near_miss(scene: Scene, sigma: float, seed: int) -> list[PhotoPrior]:
+    """Draw one prior a photo as `chen` does, but moved by 0.1 to 0.5 radii and turned by 5 to 20 degrees.
+
+    From there much of the photo is in view, from the wrong side: a pose near the prior must not be believed.
+    """
+    return _uniform(scene, sigma, seed, _Ranges(_NEAR_MISS_ROTATION_DEG, _NEAR_MISS_TRANSLATION, 1))
+
+
+def sweep_rotation(scene: Scene, sigma: float, seed: int) -> list[PhotoPrior]:
     """Pan every photo to the right by 0 to `sigma` times the rotation of `paper_bounds`, in ten steps."""
     angles = _steps(sigma * paper_bounds(scene)[0])
     return _sweep(scene, sigma, [(np.array([0.0, angle, 0.0]), np.zeros(3)) for angle in angles])
 
 
-def sweep_translation(scene: Scene, sigma: float, seed: int) -> list[Prior]:
+def sweep_translation(scene: Scene, sigma: float, seed: int) -> list[PhotoPrior]:
     """Move every photo to the right by 0 to `sigma` times the translation of `paper_bounds`, in ten steps."""
     distances = _steps(sigma * paper_bounds(scene)[1])
     return _sweep(scene, sigma, [(np.zeros(3), np.array([distance, 0.0, 0.0])) for distance in distances])
 
 
-PROTOCOLS: dict[str, Callable[[Scene, float, int], list[Prior]]] = {
+PROTOCOLS: dict[str, Callable[[Scene, float, int], list[PhotoPrior]]] = {
     "paper": paper,
     "chen": chen,
+    "near-miss": near_miss,
     "sweep-rotation": sweep_rotation,
     "sweep-translation": sweep_translation,
 }
 SWEEPS = ("sweep-rotation", "sweep-translation")
 
 
+@dataclass(frozen=True)
+class _Ranges:
+    """Ranges of uniformly distributed errors, in degrees and in radii of the trajectory, and the priors a photo."""
+
+    rotation_deg: tuple[float, float]
+    translation: tuple[float, float]
+    repetitions: int
+
+
+def _uniform(scene: Scene, sigma: float, seed: int, ranges: _Ranges) -> list[PhotoPrior]:
+    """Draw priors of all photos, moved and turned in random directions by amounts out of ranges times `sigma`."""
+    radius = trajectory_radius(scene)
+    covariance = PriorError(
+        sigma * np.radians(_root_mean_square(*ranges.rotation_deg)),
+        sigma * radius * _root_mean_square(*ranges.translation),
+    ).covariance
+    priors = []
+    for index, photo in enumerate(scene.photos):
+        for repetition in range(ranges.repetitions):
+            rng = np.random.default_rng([seed, index, repetition])
+            translation = sigma * radius * rng.uniform(*ranges.translation) * random_unit_vector(rng)
+            rotation = sigma * np.radians(rng.uniform(*ranges.rotation_deg)) * random_unit_vector(rng)
+            priors.append(PhotoPrior(index, repetition, _moved(photo.T_map_camera, rotation, translation), covariance))
+    return priors
+
+
 def _steps(bound: float) -> np.ndarray:
     return np.linspace(0.0, bound, _SWEEP_STEPS + 1)
 
 
-def _sweep(scene: Scene, sigma: float, moves: list[tuple[np.ndarray, np.ndarray]]) -> list[Prior]:
+def _sweep(scene: Scene, sigma: float, moves: list[tuple[np.ndarray, np.ndarray]]) -> list[PhotoPrior]:
     """Return the priors of all photos, each moved by all `moves` (rotation vector, translation)."""
     covariance = paper_prior_error(scene, sigma).covariance
     return [
-        Prior(index, step, _moved(photo.T_map_camera, *move), covariance)
+        PhotoPrior(index, step, _moved(photo.T_map_camera, *move), covariance)
         for index, photo in enumerate(scene.photos)
         for step, move in enumerate(moves)
     ]

@@ -17,7 +17,7 @@ from typing import Any
 import gsfeatloc_ros
 from gsfeatloc_ros.evaluate.dataset import Scene
 from gsfeatloc_ros.evaluate.metrics import QueryResult
-from gsfeatloc_ros.evaluate.protocol import Prior
+from gsfeatloc_ros.evaluate.protocol import PhotoPrior
 from gsfeatloc_ros.evaluate.run import Run
 
 # Rooms of the package that no result depends on.
@@ -130,10 +130,20 @@ class SceneHash:
 
 
 def hash_scene(scene: Scene) -> SceneHash:
-    """Return the hashes of a scene. Of the photos themselves only the sizes are taken.
+    """Return the hashes of a scene.
 
     Raises:
         OSError: the map or a photo cannot be read.
+    """
+    map_files = sorted(scene.map_path.rglob("*.*")) if scene.map_path.is_dir() else [scene.map_path]
+    return SceneHash(_files(map_files), hash_photos(scene))
+
+
+def hash_photos(scene: Scene) -> str:
+    """Return the hash of a scene's photos with their cameras and poses; of the photos only the sizes are taken.
+
+    Raises:
+        OSError: a photo cannot be read.
     """
     photos = []
     for photo in scene.photos:
@@ -142,11 +152,10 @@ def hash_scene(scene: Scene) -> SceneHash:
         photos += [repr((camera.width, camera.height, camera.model)).encode()]
         photos += [camera.K.tobytes(), camera.distortion.tobytes()]
     photos += [scene.trajectory.tobytes(), repr(scene.background).encode()]
-    map_files = sorted(scene.map_path.rglob("*.*")) if scene.map_path.is_dir() else [scene.map_path]
-    return SceneHash(_files(map_files), _digest(photos))
+    return _digest(photos)
 
 
-def fingerprint_of(run: Run, scene: SceneHash, priors: Iterable[Prior]) -> Fingerprint:
+def fingerprint_of(run: Run, scene: SceneHash, priors: Iterable[PhotoPrior]) -> Fingerprint:
     """Return the fingerprint of a run in a scene."""
     return Fingerprint(
         settings=run.settings(),

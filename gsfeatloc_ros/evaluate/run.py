@@ -4,24 +4,27 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
-from functools import lru_cache
+from dataclasses import asdict, dataclass, replace
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 
+from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.parameter import Value, settings_from
 from gsfeatloc_ros.evaluate.ablation import ablated_localizer
-from gsfeatloc_ros.evaluate.corruptions import CORRUPTIONS
-from gsfeatloc_ros.evaluate.dataset import PosedPhoto, Scene
+from gsfeatloc_ros.evaluate.corruptions import corrupt
+from gsfeatloc_ros.evaluate.dataset import Scene
+from gsfeatloc_ros.evaluate.degradations import degrade
 from gsfeatloc_ros.evaluate.extras import import_extra
-from gsfeatloc_ros.evaluate.metrics import QueryResult, Scoring, measure
+from gsfeatloc_ros.evaluate.metrics import Cost, QueryResult, Scoring, measure
+from gsfeatloc_ros.evaluate.negatives import NEGATIVES, Negative, NegativeOptions, draw_negatives
 from gsfeatloc_ros.evaluate.priors_file import read_priors
-from gsfeatloc_ros.evaluate.protocol import PROTOCOLS, Prior, trajectory_radius
+from gsfeatloc_ros.evaluate.protocol import PROTOCOLS, PhotoPrior, trajectory_radius
 from gsfeatloc_ros.evaluate.published import PublishedLocalizer
-from gsfeatloc_ros.evaluate.scene import load_scene, load_scene_renderer
+from gsfeatloc_ros.evaluate.scene import load_degraded_renderer, load_scene, load_scene_renderer
 from gsfeatloc_ros.localize.engine import load_matcher
 from gsfeatloc_ros.localize.estimate import Trace
 from gsfeatloc_ros.localize.localizer import Localizer
@@ -51,6 +54,8 @@ class Run:
         options: parameters of LocalizerOptions that differ from the default, with their values.
         ablation: the one of ABLATIONS that is taken out, or "".
         corruption: the one of CORRUPTIONS that is done to the photos, or "".
+        degradation: the one of DEGRADATIONS that is done to the map, or "".
+        negative: what the photos are in place of the scene's own: one of NEGATIVES, the folder of another scene, or "".
     """
 
     scene: Path
@@ -65,6 +70,8 @@ class Run:
     options: tuple[tuple[str, float], ...] = ()
     ablation: str = ""
     corruption: str = ""
+    degradation: str = ""
+    negative: str = ""
 
     def settings(self) -> dict[str, Any]:
         """Return the same, ready for JSON."""
@@ -91,10 +98,27 @@ class Task:
     run: Run
     version: str
     photo: str
-    prior: Prior
+    prior: PhotoPrior
+
+    @property
+    def drawn_map(self) -> DrawnMap:
+        """The map that it is localized in."""
+        run = self.run
+        return DrawnMap(run.scene, run.map_path, self.version, run.degradation, run.seed if run.degradation else 0)
 
 
-def draw_priors(run: Run, scene: Scene) -> list[Prior]:
+@dataclass(frozen=True)
+class DrawnMap:
+    """A map that is drawn: of a scene in the version of its files, with a degradation ("" for none) and its seed."""
+
+    scene: Path
+    map_path: Path | None
+    version: str
+    degradation: str = ""
+    seed: int = 0
+
+
+def draw_priors(run: Run, scene: Scene) -> list[PhotoPrior]:
     """Draw or read the priors of a run, in the order of the photos.
 
     Raises:
@@ -103,6 +127,23 @@ def draw_priors(run: Run, scene: Scene) -> list[Prior]:
     if run.priors_file is not None:
         return read_priors(run.priors_file, scene)
     return PROTOCOLS[run.protocol](scene, run.sigma, run.seed)
+
+
+def load_negative_scene(run: Run) -> Scene | None:
+    """Load the scene that the negatives of a run are photos of; None where they are of no other scene.
+
+    Raises:
+        ValueError, RuntimeError: as load_scene.
+    """
+    if not run.negative or run.negative in NEGATIVES:
+        return None
+    # Its own map is not needed.
+    return load_scene(run.negative, run.map_path or run.negative)
+
+
+def run_negatives(run: Run, scene: Scene, other: Scene | None) -> list[Negative]:
+    """Draw the negatives of a run, all that there are; `other` as load_negative_scene."""
+    return draw_negatives(scene, other or run.negative, NegativeOptions(run.sigma, run.seed))
 
 
 def localize_all(tasks: Sequence[Task], jobs: int | None) -> Iterator[tuple[Task, QueryResult]]:
@@ -132,20 +173,22 @@ def localize(task: Task, threads: int = 0) -> QueryResult:
 
     Only the localization is timed, not reading the photo.
     """
-    scene, photo, image = _open(task)
-    prior, localizer = task.prior, _localizer(task.run, task.version, threads)
-    start = time.perf_counter()
-    estimate = localizer.localize(image, photo.camera, prior.T_map_camera, prior.covariance)
-    milliseconds = 1000.0 * (time.perf_counter() - start)
-    scoring = Scoring(trajectory_radius(scene), prior_is_answer=task.run.method == "published")
-    return measure(photo, prior, estimate, milliseconds, scoring)
+    scene, (image, camera) = _open(task)
+    run, prior = task.run, task.prior
+    localizer = _localizer(_localizer_of(run), task.drawn_map, threads)
+    start, cpu_start = time.perf_counter(), time.process_time()
+    estimate = localizer.localize(image, camera, prior.T_map_camera, prior.covariance)
+    cost = Cost(1000.0 * (time.perf_counter() - start), 1000.0 * (time.process_time() - cpu_start))
+    photo = replace(scene.photos[prior.photo], name=task.photo)
+    scoring = Scoring(trajectory_radius(scene), run.method == "published", bool(run.negative))
+    return measure(photo, prior, estimate, cost, scoring)
 
 
 def trace(task: Task) -> Trace:
     """Localize from one prior, and keep the pictures that the estimate was made from."""
-    _, photo, image = _open(task)
-    prior, localizer = task.prior, _localizer(task.run, task.version, threads=0)
-    return localizer.trace(image, photo.camera, prior.T_map_camera, prior.covariance)
+    _, (image, camera) = _open(task)
+    localizer = _localizer(_localizer_of(task.run), task.drawn_map, threads=0)
+    return localizer.trace(image, camera, task.prior.T_map_camera, task.prior.covariance)
 
 
 @lru_cache(maxsize=1)
@@ -155,9 +198,14 @@ def open_scene(folder: Path, map_path: Path | None, version: str) -> Scene:
 
 
 @lru_cache(maxsize=1)
-def open_renderer(folder: Path, map_path: Path | None, version: str, threads: int = 0) -> Renderer:
-    """Load the renderer of a run's map."""
-    return load_scene_renderer(open_scene(folder, map_path, version), RendererSettings(threads=threads))
+def open_renderer(drawn: DrawnMap, threads: int = 0) -> Renderer:
+    """Load the renderer of a map."""
+    scene, settings = open_scene(drawn.scene, drawn.map_path, drawn.version), RendererSettings(threads=threads)
+    if drawn.degradation:
+        return load_degraded_renderer(
+            scene, settings, partial(degrade, drawn.degradation, scene=scene, seed=drawn.seed)
+        )
+    return load_scene_renderer(scene, settings)
 
 
 @lru_cache(maxsize=1)
@@ -165,12 +213,17 @@ def _matcher(name: str, device: str) -> Matcher:
     return load_matcher(MatcherSettings(name=name), device)
 
 
+def _localizer_of(run: Run) -> Run:
+    """Return the run with the same localizer whose photos and priors are the plain ones."""
+    return replace(run, protocol="paper", priors_file=None, sigma=1.0, corruption="", negative="")
+
+
 @lru_cache(maxsize=1)
-def _localizer(run: Run, version: str, threads: int) -> Localizer | PublishedLocalizer:
+def _localizer(run: Run, drawn: DrawnMap, threads: int) -> Localizer | PublishedLocalizer:
     if threads:
         cv2.setNumThreads(threads)
-    scene = open_scene(run.scene, run.map_path, version)
-    renderer = open_renderer(run.scene, run.map_path, version, threads)
+    scene = open_scene(drawn.scene, drawn.map_path, drawn.version)
+    renderer = open_renderer(drawn, threads)
     localizer = _create_localizer(run, renderer, _matcher(run.matcher, renderer.device))
     # What is compiled or loaded at the first call does not count.
     localizer.localize(scene.read_photo(scene.photos[0]), scene.camera, scene.photos[0].T_map_camera)
@@ -183,13 +236,25 @@ def _create_localizer(run: Run, renderer: Renderer, matcher: Matcher) -> Localiz
     return ablated_localizer(renderer, matcher, run.localizer_options(), run.ablation)
 
 
-def _open(task: Task) -> tuple[Scene, PosedPhoto, np.ndarray]:
-    """Return the scene of a task, its photo, and the image (H, W, 3) uint8 RGB that the localizer is given of it."""
+def _open(task: Task) -> tuple[Scene, tuple[np.ndarray, Camera]]:
+    """Return the scene of a task, and the image (H, W, 3) uint8 RGB with its camera that the localizer is given."""
     run = task.run
     scene = open_scene(run.scene, run.map_path, task.version)
+    if run.negative:
+        negative = _negatives(run, task.version)[task.photo]
+        return scene, (negative.read(), negative.camera)
     photo = scene.photos[task.prior.photo]
     image = scene.read_photo(photo)
-    return scene, photo, CORRUPTIONS[run.corruption](image) if run.corruption else image
+    if run.corruption:
+        return scene, corrupt(run.corruption, image, photo.camera, (run.seed, task.prior.photo))
+    return scene, (image, photo.camera)
+
+
+@lru_cache(maxsize=1)
+def _negatives(run: Run, version: str) -> dict[str, Negative]:
+    """Return the negatives of a run by the name of the photo."""
+    scene = open_scene(run.scene, run.map_path, version)
+    return {negative.name: negative for negative in run_negatives(run, scene, load_negative_scene(run))}
 
 
 def _localize_numbered(number: int, task: Task, threads: int) -> tuple[int, QueryResult]:

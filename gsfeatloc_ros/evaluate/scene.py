@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,7 +10,8 @@ from gsfeatloc_ros.evaluate import colmap, nerf_synthetic, nerfstudio
 from gsfeatloc_ros.evaluate.dataset import Scene, read_image
 from gsfeatloc_ros.localize.engine import load_renderer
 from gsfeatloc_ros.localize.settings import MapSettings, RendererSettings
-from gsfeatloc_ros.render import Renderer
+from gsfeatloc_ros.maps import GaussianMap, load_map
+from gsfeatloc_ros.render import DrawOptions, Renderer, create_renderer
 
 # Of each kind, what its folder holds.
 _KINDS = {
@@ -64,6 +66,14 @@ def load_scene_renderer(scene: Scene, renderer: RendererSettings) -> Renderer:
         ValueError, OSError, RuntimeError: the settings or the map cannot be used; the message says why.
     """
     return load_renderer(MapSettings(path=str(scene.map_path), cache=False), renderer, scene.background)
+
+
+def load_degraded_renderer(
+    scene: Scene, renderer: RendererSettings, degrade: Callable[[GaussianMap], GaussianMap]
+) -> Renderer:
+    """Make the renderer of what `degrade` makes of a scene's map; otherwise as `load_scene_renderer`."""
+    options = DrawOptions(scene.background, renderer.sh_degree, renderer.resolution_scale)
+    return create_renderer(degrade(load_map(scene.map_path)), renderer.device, renderer.threads, options)
 
 
 def _find_map(folder: Path) -> Path:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 from gsfeatloc_ros.evaluate.metrics import (
@@ -16,6 +17,7 @@ from gsfeatloc_ros.evaluate.metrics import (
     by_step,
     summarize,
 )
+from gsfeatloc_ros.evaluate.negatives import NEGATIVES
 from gsfeatloc_ros.evaluate.protocol import SWEEPS
 from gsfeatloc_ros.evaluate.run import Run, Task
 
@@ -82,17 +84,29 @@ class Group:
             "options": dict(run.options),
             "ablation": run.ablation,
             "corruption": run.corruption,
+            "degradation": run.degradation,
+            "negative": Path(run.negative).name,
             **self.summary,
         }
 
     @property
     def label(self) -> str:
-        """Method, matcher, changed options, ablation and corruption in short."""
+        """Method, matcher, changed options, ablation and condition in short."""
         run = self.run
         words = [run.method, run.matcher, *(f"{name}={value:g}" for name, value in run.options)]
         words += [f"without {run.ablation}"] if run.ablation else []
-        words += [f"{run.corruption} photos"] if run.corruption else []
-        return " ".join(words)
+        return " ".join([*words, *condition_words(run)])
+
+
+def condition_words(run: Run) -> list[str]:
+    """Return what is done to the photos and the map of a run in words; none: nothing."""
+    words = [f"{run.corruption} photos"] if run.corruption else []
+    words += [f"{run.degradation} map"] if run.degradation else []
+    if run.negative in NEGATIVES:
+        words += [f"not of the scene: {run.negative}"]
+    elif run.negative:
+        words += [f"not of the scene: of {Path(run.negative).name}"]
+    return words
 
 
 def over_seeds(runs: Sequence[RunResults]) -> list[Group]:
@@ -148,15 +162,21 @@ def run_table(groups: Sequence[Group]) -> str:
                 f"{100 * summary['success_rate']:.1f} %",
                 str(summary["answered"]),
                 str(summary["wrong_answers"]),
-                f"{summary['rotation_error_deg']['median']:.3f}",
-                f"{summary['translation_error']['median']:.4f}",
+                "-" if run.negative else f"{summary['rotation_error_deg']['median']:.3f}",
+                "-" if run.negative else f"{summary['translation_error']['median']:.4f}",
                 "-" if nees is None else f"{nees:.2f}",
                 "-" if coverage is None else f"{100 * coverage['95']:.0f} %",
                 f"{summary['milliseconds']['median']:.0f}",
             )
         )
+    return aligned(rows)
+
+
+def aligned(rows: Sequence[Sequence[str]]) -> str:
+    """Return rows of cells as lines, the columns aligned."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return "\n".join("  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)) for row in rows)
+    lines = ["  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)) for row in rows]
+    return "\n".join(line.rstrip() for line in lines)
 
 
 def run_summary(report: dict[str, Any]) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import Enum
 
@@ -9,6 +10,7 @@ import numpy as np
 
 from gsfeatloc_ros.common.photo import Photo
 from gsfeatloc_ros.localize.evidence import Evidence
+from gsfeatloc_ros.localize.protection import ProtectionLevel, protection_level
 from gsfeatloc_ros.match.base import Matches
 from gsfeatloc_ros.render.base import Render
 
@@ -44,6 +46,11 @@ class Estimate:
     milliseconds: dict[str, float] = field(default_factory=dict)
 
     @property
+    def protection(self) -> ProtectionLevel | None:
+        """How far the pose may be off; None unless LOCALIZED."""
+        return None if self.covariance is None else protection_level(self.covariance)
+
+    @property
     def localized(self) -> bool:
         """Whether there is a pose to use."""
         return self.status is Status.LOCALIZED
@@ -59,9 +66,12 @@ class Trace:
         render: the last render that was compared with the photo; None where there was none. Of an answer, it is within
             half a pixel of the estimate, and of the photo's size.
         correspondences: pixels of the inliers (photo, render).
+        changed: makes the mask of where the photo shows something else than the map: (H, W) uint8, 255 there; None
+            where no pose was found.
     """
 
     estimate: Estimate
     photo: Photo
     render: Render | None = None
     correspondences: Matches = field(default_factory=Matches.none)
+    changed: Callable[[], np.ndarray] | None = None

@@ -5,14 +5,26 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 
+import cv2
 import numpy as np
 
+from gsfeatloc_ros.common.arrays import to_host
 from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.photo import Photo
 from gsfeatloc_ros.common.stage_clock import StageClock
+from gsfeatloc_ros.localize.blur import estimate_blur
+from gsfeatloc_ros.localize.comparison import changed_mask, compare
 from gsfeatloc_ros.localize.estimate import Estimate, Status, Trace
-from gsfeatloc_ros.localize.evidence import Evidence, correlation, coverage, deviation, inlier_ratio, verdict
+from gsfeatloc_ros.localize.evidence import (
+    Evidence,
+    coverage,
+    deviation,
+    focal_length_is_wrong,
+    probability_wrong,
+    verdict,
+)
 from gsfeatloc_ros.localize.options import LocalizerOptions
 from gsfeatloc_ros.localize.query import Components, MatchedView, Query
 from gsfeatloc_ros.localize.search import (
@@ -25,10 +37,16 @@ from gsfeatloc_ros.localize.search import (
     spread_poses,
 )
 from gsfeatloc_ros.match import Matcher, Tracker, create_tracker
+from gsfeatloc_ros.pose.camera_fit import CameraFit, fit_camera
+from gsfeatloc_ros.pose.solve import Correspondences
 from gsfeatloc_ros.render.base import Renderer
 
 # A render nearer to the photo than this many pixels is at the estimate.
 _MAX_SETTLED_OFFSET = 0.5
+# With a blur of this extent, in pixels, corners may be off by twice the reprojection error allowed.
+_BLUR_THAT_DOUBLES_ERRORS = 25.0
+# Matches farther off than this many pixels say nothing of the camera.
+_MAX_CAMERA_ERROR = 20.0
 # Views nearer to each other than this share of the default deviations of a prior show the same.
 _MIN_VIEW_STEP = 0.3
 # Views are searched in batches of this many; the best of each are followed before the next is rendered.
@@ -111,11 +129,19 @@ class Localizer:
             prior_covariance = options.prior_covariance()
         if np.shape(prior_covariance) != (6, 6) or not np.isfinite(prior_covariance).all():
             raise ValueError("the prior's covariance must be a finite 6x6 matrix")
-        prior = _Prior(np.asarray(T_map_camera_prior, np.float64), np.asarray(prior_covariance, np.float64))
+        prior = _Prior(
+            np.asarray(T_map_camera_prior, np.float64),
+            np.asarray(prior_covariance, np.float64),
+            options.prior_covariance(),
+        )
         clock = StageClock(self._now, interrupted)
         with clock.stage("prepare"):
             photo = Photo.undistorted(image, camera, options.max_image_width)
-        trace = self._search(Query(self._components, photo, clock), prior)
+
+        def plausible(pose: np.ndarray) -> bool:
+            return prior.deviation(pose) <= options.limits.max_deviation
+
+        trace = self._search(Query(self._components, photo, clock, plausible), prior)
         return replace(trace, estimate=replace(trace.estimate, milliseconds=clock.milliseconds()))
 
     def _search(self, query: Query, prior: _Prior) -> Trace:
@@ -138,7 +164,7 @@ class Localizer:
                 if pose is None:
                     continue
                 candidate = self._refine(query, pose, prior)
-                if not candidate.reasons_against:
+                if not candidate.reasons_against or candidate.only_the_camera_is_wrong:
                     return candidate.trace(query.photo, views - 1)
                 rejected = rejected or candidate
         if rejected is not None:
@@ -158,46 +184,73 @@ class Localizer:
     def _refine(self, query: Query, pose: np.ndarray, prior: _Prior) -> _Candidate:
         """Render and track at `pose`, then at each estimate, until the render is where the photo is; then verify."""
         view = query.track(pose)
+        with query.clock.stage("track"):
+            blur = estimate_blur(query.photo.gray(), cv2.cvtColor(to_host(view.image), cv2.COLOR_RGB2GRAY))
+        if blur is not None:
+            view = query.track(pose if view.solution is None else view.solution.T_map_camera, blur)
         passes = 1
         while (
             view.solution is not None
             and view.offset(query.photo.camera) >= _MAX_SETTLED_OFFSET
             and passes < self._components.options.max_passes
         ):
-            view = query.track(view.solution.T_map_camera)
+            view = query.track(view.solution.T_map_camera, blur)
             passes += 1
-        with query.clock.stage("verify"):
-            return self._verify(query, view, passes, prior)
-
-    def _verify(self, query: Query, view: MatchedView, passes: int, prior: _Prior) -> _Candidate:
-        """Collect what speaks for the pose that the last view gave, and what against it."""
-        options, camera = self._components.options, query.photo.camera
         evidence = Evidence(
             corners=len(query.tracker.corners),
             matches=view.matches,
-            lifted=len(view.points),
+            lifted=len(view.found.pixels),
             inliers=view.inliers,
+            blur_px=blur.extent if blur else 0.0,
             passes=passes,
         )
-        if view.solution is not None:
+        return self._verify(query, view, evidence, prior)
+
+    def _verify(self, query: Query, view: MatchedView, evidence: Evidence, prior: _Prior) -> _Candidate:
+        """Collect what speaks for the pose that the last view gave, and what against it."""
+        options, camera = self._components.options, query.photo.camera
+        if view.solution is None:
+            return _Candidate(view, evidence, None, verdict(evidence, options.limits))
+        # In a blurred photo all corners are less certain.
+        blurred = min(evidence.blur_px / _BLUR_THAT_DOUBLES_ERRORS, 1.0)
+        comparison = compare(query, view, (1.0 + blurred) * options.pose.max_reprojection_error)
+        with query.clock.stage("verify"):
             pose = view.solution.T_map_camera
+            fit = fit_camera(camera, pose, _near(view), options.pose)
             evidence = replace(
                 evidence,
-                inlier_ratio=inlier_ratio(view.solution.errors, options.pose.max_reprojection_error),
+                inlier_ratio=comparison.inlier_ratio,
+                render_inlier_ratio=comparison.render_inlier_ratio,
                 coverage=coverage(view.correspondences.a, camera.width, camera.height),
-                correlation=correlation(query.photo, view.render),
+                correlation=comparison.explained_correlation(0.5),
+                low_correlation=comparison.explained_correlation(0.25),
+                changed=comparison.changed_share(),
                 reprojection_error_px=view.solution.reprojection_error,
-                deviation=deviation(pose, prior.pose, prior.covariance, options.prior_covariance()),
+                deviation=prior.deviation(pose),
+                focal_error=fit.focal if fit else float("nan"),
+                focal_sigma=fit.focal_sigma if fit else float("nan"),
             )
-        return _Candidate(view, evidence, verdict(evidence, options.limits))
+            evidence = replace(evidence, probability_wrong=probability_wrong(evidence))
+            return _Candidate(view, evidence, fit, verdict(evidence, options.limits))
+
+
+def _near(view: MatchedView) -> Correspondences:
+    """Return the correspondences that may be right if the camera is not as it was calibrated."""
+    assert view.solution is not None
+    return view.found.select(view.solution.errors <= _MAX_CAMERA_ERROR)
 
 
 @dataclass(frozen=True, eq=False)
 class _Prior:
-    """A pose (4, 4) T_map_camera with its covariance (6, 6)."""
+    """A pose (4, 4) T_map_camera with its covariance (6, 6), and that of priors which come without."""
 
     pose: np.ndarray
     covariance: np.ndarray
+    default_covariance: np.ndarray
+
+    def deviation(self, pose: np.ndarray) -> float:
+        """Return how far a pose (4, 4) is from it in standard deviations."""
+        return deviation(pose, self.pose, self.covariance, self.default_covariance)
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,7 +259,20 @@ class _Candidate:
 
     view: MatchedView
     evidence: Evidence
+    camera_fit: CameraFit | None
     reasons_against: tuple[str, ...]
+
+    @property
+    def only_the_camera_is_wrong(self) -> bool:
+        """Whether nothing but the camera's calibration speaks against it: no other view would help."""
+        return len(self.reasons_against) == 1 and focal_length_is_wrong(self.evidence)
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """Covariance (6, 6) of the pose: what the camera's errors would move it by is part of it."""
+        assert self.view.solution is not None
+        shift = self.camera_fit.pose_shift if self.camera_fit else np.zeros(6)
+        return self.view.solution.covariance + np.outer(shift, shift)
 
     def trace(self, photo: Photo, views: int) -> Trace:
         """Return the estimate that this is, after a search of `views` other views than the prior's."""
@@ -217,12 +283,14 @@ class _Candidate:
         else:
             estimate = Estimate(
                 Status.LOCALIZED,
-                f"{evidence.inliers} inliers of {evidence.lifted} corners, correlation {evidence.correlation:.2f}",
+                f"{evidence.inliers} inliers of {evidence.lifted} corners, correlation {evidence.correlation:.2f}; "
+                f"{evidence.changed:.0%} of the photo is not as in the map",
                 view.solution.T_map_camera,
-                view.solution.covariance,
+                self.covariance,
                 evidence,
             )
-        return Trace(estimate, photo, view.render, view.correspondences)
+        changed = partial(changed_mask, photo, view) if view.solution else None
+        return Trace(estimate, photo, view.render, view.correspondences, changed)
 
 
 def _confirmed(small: Query, hint: MatchedView) -> np.ndarray | None:
@@ -237,9 +305,9 @@ def _confirmed(small: Query, hint: MatchedView) -> np.ndarray | None:
 def _nothing_in_common(photo: Photo, features: int, best: MatchedView, views: int) -> Trace:
     """None of the views, of which the first was the prior's, suggested a pose; `best` had the most inliers."""
     where = "at the prior" if views == 1 else f"at the prior and in {views - 1} views around it"
-    evidence = Evidence(matches=best.matches, lifted=len(best.points), inliers=best.inliers, views=views - 1)
+    evidence = Evidence(matches=best.matches, lifted=len(best.found.pixels), inliers=best.inliers, views=views - 1)
     reason = (
         f"photo and renders {where} have nothing in common: {features} features in the photo, at best {best.matches} "
-        f"matches, {len(best.points)} with depth, {best.inliers} inliers"
+        f"matches, {len(best.found.pixels)} with depth, {best.inliers} inliers"
     )
     return Trace(Estimate(Status.FAILED, reason, evidence=evidence), photo, best.render)

@@ -6,12 +6,15 @@ from collections.abc import Callable, Sized
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+import cv2
 import numpy as np
 
+from gsfeatloc_ros.common.arrays import Array, to_host
 from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.geometry import invert, transform
 from gsfeatloc_ros.common.photo import Photo
 from gsfeatloc_ros.common.stage_clock import StageClock
+from gsfeatloc_ros.localize.blur import Blur
 from gsfeatloc_ros.localize.options import LocalizerOptions
 from gsfeatloc_ros.match.base import Matcher, Matches, Tracker
 from gsfeatloc_ros.pose.lift import lift
@@ -26,17 +29,19 @@ class MatchedView:
     Attributes:
         pose: (4, 4) T_map_camera of the view.
         render: the map as seen there.
+        image: (H, W, 3) uint8 RGB of it, as it was matched: blurred as the photo is.
         matches: number of the photo's pixels that were found in the render.
         lifted_matches: those whose render pixel has a depth.
-        points: (M, 3) map points of `lifted_matches`.
+        found: these with the points of the map.
         solution: the photo's pose from them, None where they agree on none.
     """
 
     pose: np.ndarray
     render: Render
+    image: Array
     matches: int
     lifted_matches: Matches
-    points: np.ndarray
+    found: Correspondences
     solution: PoseSolution | None
 
     @property
@@ -56,7 +61,7 @@ class MatchedView:
         """
         if self.solution is None:
             return float("inf")
-        points = self.points[self.solution.inliers]
+        points = self.found.points[self.solution.inliers]
         here, there = (camera.project(transform(invert(T), points)) for T in (self.pose, self.solution.T_map_camera))
         return float(np.median(np.linalg.norm(here - there, axis=1)))
 
@@ -86,11 +91,13 @@ class Query:
         components: what it is localized with.
         photo: without distortion, of the size at which it is compared.
         clock: counts the time of the stages.
+        plausible: whether a pose (4, 4) may be the photo's, by what was known before.
     """
 
     components: Components
     photo: Photo
     clock: StageClock
+    plausible: Callable[[np.ndarray], bool] = lambda pose: True
 
     def limited(self, max_width: int) -> Query:
         """Return the query of the same photo, at most `max_width` pixels wide."""
@@ -112,27 +119,34 @@ class Query:
         matcher = self.components.matcher
         render = self._render(pose)
         with self.clock.stage("features"):
-            features = matcher.features(render.device_image())
+            image = render.device_image()
+            features = matcher.features(image)
         with self.clock.stage("match"):
             matches = matcher.match(self.features, features)
-        return self._solve(pose, render, matches)
+        return self._solve(pose, render, image, matches)
 
-    def track(self, pose: np.ndarray) -> MatchedView:
-        """Do the same where the pose is nearly the photo's: track the photo's corners to the render instead."""
+    def track(self, pose: np.ndarray, blur: Blur | None = None) -> MatchedView:
+        """Do the same where the pose is nearly the photo's: track the photo's corners to the render instead.
+
+        The render is blurred by `blur`, as the photo is; None for a sharp one.
+        """
         tracker, render = self.tracker, self._render(pose)
         with self.clock.stage("track"):
-            matches = tracker.track(render.device_image())
-        return self._solve(pose, render, matches)
+            image = render.device_image()
+            if blur is not None:
+                image = cv2.filter2D(to_host(image), -1, blur.kernel)
+            matches = tracker.track(image)
+        return self._solve(pose, render, image, matches)
 
     def _render(self, pose: np.ndarray) -> Render:
         with self.clock.stage("render"):
             return self.components.renderer.render(self.photo.camera, pose)
 
-    def _solve(self, pose: np.ndarray, render: Render, matches: Matches) -> MatchedView:
+    def _solve(self, pose: np.ndarray, render: Render, image: Array, matches: Matches) -> MatchedView:
         options, camera = self.components.options, self.photo.camera
         with self.clock.stage("solve"):
             lifted = lift(render, camera, pose, matches.b, options.lift)
             lifted_matches = matches.select(lifted.valid)
             found = Correspondences(lifted_matches.a, lifted.points[lifted.valid], lifted.sigmas[lifted.valid])
-            solution = solve_pose(camera, found, options.pose, options.seed)
-        return MatchedView(pose, render, len(matches), lifted_matches, found.points, solution)
+            solution = solve_pose(camera, found, options.pose, options.seed, self.plausible)
+        return MatchedView(pose, render, image, len(matches), lifted_matches, found, solution)

@@ -51,6 +51,10 @@ class Matches:
     def __len__(self) -> int:
         return len(self.a)
 
+    def swapped(self) -> Matches:
+        """Return the matches from the second image to the first."""
+        return Matches(self.b, self.a, self.scores)
+
     def select(self, kept: np.ndarray) -> Matches:
         """Return the matches that a mask (M,) or indices name."""
         return Matches(self.a[kept], self.b[kept], self.scores[kept])
@@ -73,6 +77,10 @@ class Tracker(Protocol):
 
     def track(self, image: Array) -> Matches:
         """Find the photo's corners in a render (H, W, 3) uint8 RGB of its size; those that cannot be are left out."""
+        ...
+
+    def track_back(self, image: Array) -> Matches:
+        """Find the corners of a render in the photo; `a` of the matches are still the photo's pixels."""
         ...
 
 

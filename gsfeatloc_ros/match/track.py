@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 
@@ -13,6 +15,8 @@ from gsfeatloc_ros.match.base import Matches
 # Corners (Shi and Tomasi, 1994): how many, how many pixels apart, of what part of the strongest one's strength, and
 # over a block of how many pixels a side that is measured.
 MAX_CORNERS = 800
+# Of a render, that are tracked into the photo.
+MAX_RENDER_CORNERS = 300
 MIN_CORNER_DISTANCE = 7
 MIN_CORNER_QUALITY = 0.005
 CORNER_BLOCK = 5
@@ -42,30 +46,61 @@ class CornerTracker:
     def __init__(self, photo: Photo) -> None:
         gray = photo.gray()
         self._structure = _structure(gray)
-        seen = seen_off_the_border(photo)
-        corners = cv2.goodFeaturesToTrack(
-            gray, MAX_CORNERS, MIN_CORNER_QUALITY, MIN_CORNER_DISTANCE, mask=seen, blockSize=CORNER_BLOCK
-        )
-        self.corners: np.ndarray = np.empty((0, 2), np.float32) if corners is None else corners.reshape(-1, 2)
+        self.corners = _find_corners(gray, MAX_CORNERS, seen_off_the_border(photo))
+        self._last_render: _Seen | None = None
 
     def track(self, image: Array) -> Matches:
         """Find the photo's corners in a render (H, W, 3) uint8 RGB of its size.
 
         Corners that cannot be followed there and back are left out.
         """
-        if len(self.corners) == 0:
-            return Matches.none()
-        structure = _structure(cv2.cvtColor(to_host(image), cv2.COLOR_RGB2GRAY))
-        there, found = _flow(self._structure, structure, self.corners)
-        back, found_back = _flow(structure, self._structure, there)
-        kept = found & found_back & (np.linalg.norm(back - self.corners, axis=1) <= MAX_RETURN_ERROR)
-        pixels = self.corners[kept].astype(np.float64)
-        return Matches(pixels, there[kept].astype(np.float64), np.ones(len(pixels)))
+        return _there_and_back(self._structure, self._see(image).structure, self.corners)
+
+    def track_back(self, image: Array) -> Matches:
+        """Find the corners of a render (H, W, 3) uint8 RGB in the photo; `a` of the matches are the photo's pixels."""
+        render = self._see(image)
+        corners = _find_corners(render.gray, MAX_RENDER_CORNERS, None)
+        return _there_and_back(render.structure, self._structure, corners).swapped()
+
+    def _see(self, image: Array) -> _Seen:
+        """Return what a render looks like; that of the last one is kept, as it is tracked both ways."""
+        if self._last_render is None or self._last_render.image is not image:
+            gray = cv2.cvtColor(to_host(image), cv2.COLOR_RGB2GRAY)
+            self._last_render = _Seen(image, gray, _structure(gray))
+        return self._last_render
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """A render, its brightness (H, W) uint8 and its local structure (H, W) uint8."""
+
+    image: Array
+    gray: np.ndarray
+    structure: np.ndarray
 
 
 def seen_off_the_border(photo: Photo) -> np.ndarray:
     """Return where to look for corners, (H, W) uint8: the border of what the lens saw is no corner of the world."""
     return cv2.erode(photo.seen.astype(np.uint8), np.ones(FLOW_WINDOW, np.uint8))
+
+
+def _find_corners(gray: np.ndarray, count: int, seen: np.ndarray | None) -> np.ndarray:
+    """Find at most `count` corners (N, 2) float32 of brightness (H, W) uint8 where `seen` (H, W) uint8 is not 0."""
+    corners = cv2.goodFeaturesToTrack(
+        gray, count, MIN_CORNER_QUALITY, MIN_CORNER_DISTANCE, mask=seen, blockSize=CORNER_BLOCK
+    )
+    return np.empty((0, 2), np.float32) if corners is None else corners.reshape(-1, 2)
+
+
+def _there_and_back(here: np.ndarray, there: np.ndarray, corners: np.ndarray) -> Matches:
+    """Match the corners (N, 2) of one structure with another; those that do not return to where they were left out."""
+    if len(corners) == 0:
+        return Matches.none()
+    moved, found = _flow(here, there, corners)
+    back, found_back = _flow(there, here, moved)
+    kept = found & found_back & (np.linalg.norm(back - corners, axis=1) <= MAX_RETURN_ERROR)
+    pixels = corners[kept].astype(np.float64)
+    return Matches(pixels, moved[kept].astype(np.float64), np.ones(len(pixels)))
 
 
 def _structure(gray: np.ndarray) -> np.ndarray:

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch.nn.functional import avg_pool2d, conv2d, grid_sample, max_pool2d, pad
 
-from gsfeatloc_ros.common.arrays import Array, to_device
+from gsfeatloc_ros.common.arrays import Array, to_device, to_host
 from gsfeatloc_ros.common.photo import Photo
 from gsfeatloc_ros.match.base import Matches
 from gsfeatloc_ros.match.tensor import LUMA
@@ -60,6 +60,7 @@ class GpuCornerTracker:
     """
 
     def __init__(self, photo: Photo, device: str) -> None:
+        self._photo, self._device = photo, device
         self._constants = _constants(*photo.seen.shape, device)
         with torch.inference_mode():
             gray = self._constants.gray(photo.image)
@@ -88,6 +89,11 @@ class GpuCornerTracker:
         kept = kept > 0
         pixels = self.corners[kept].astype(np.float64)
         return Matches(pixels, np.column_stack([x, y])[kept].astype(np.float64), np.ones(len(pixels)))
+
+    def track_back(self, image: Array) -> Matches:
+        """Find the corners of a render (H, W, 3) uint8 RGB in the photo; `a` of the matches are the photo's pixels."""
+        render = Photo(to_host(image), np.ones(self._photo.seen.shape, bool), self._photo.camera)
+        return GpuCornerTracker(render, self._device).track(self._photo.image).swapped()
 
 
 def _flow(

@@ -7,14 +7,13 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass
 
-from geometry_msgs.msg import PoseWithCovarianceStamped
 from sensor_msgs.msg import CompressedImage, Image
 
 from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.stage_clock import Interrupted
 from gsfeatloc_ros.localize.engine import Engine
 from gsfeatloc_ros.localize.options import LocalizerOptions
-from gsfeatloc_ros.node.publishers import Publishers
+from gsfeatloc_ros.node.publishers import Answer, Publishers
 from gsfeatloc_ros.node.report import Report
 from gsfeatloc_ros.node.worker import Worker
 from gsfeatloc_ros.ros_io.decode import nanoseconds
@@ -46,11 +45,11 @@ class JobResult:
 
     Attributes:
         outcome: of the image.
-        pose: the answer as it is published; None unless localized.
+        answer: as it is published; None unless localized.
     """
 
     outcome: Outcome
-    pose: PoseWithCovarianceStamped | None = None
+    answer: Answer | None = None
 
 
 class Attempts:
@@ -115,7 +114,8 @@ class Attempts:
         except Exception as error:
             # Not foreseen: a bug, or out of memory. The next image may well do.
             result, stack = JobResult(Outcome.error(error)), traceback.format_exc()
-        self._report.publish_attempt(job.message.header.stamp, result.outcome, stack)
+        protection = result.answer.protection if result.answer else None
+        self._report.publish_attempt(job.message.header.stamp, result.outcome, protection, stack)
         return result
 
     def _localize(self, job: Job, interrupted: Callable[[], bool]) -> JobResult:
@@ -133,12 +133,14 @@ class Attempts:
         if self._engine.renderer is not engine.renderer:
             return JobResult(Outcome.refused("the map was changed while this image was localized: send another"))
         outcome, T_map_camera = Outcome.of(trace.estimate), trace.estimate.T_map_camera
-        pose = self._publishers.pose_message(trace.estimate, extrinsics, header)
+        answer = self._publishers.answer(trace.estimate, extrinsics, header)
+        if job.shared:
+            self._report.camera.take(query.camera, trace.estimate)
         if job.shared and self.publishing:
-            if pose is not None and T_map_camera is not None:
+            if answer is not None and T_map_camera is not None:
                 self._report.count_answer()
-                self._publishers.publish_pose(pose, T_map_camera, extrinsics)
+                self._publishers.publish_answer(answer, T_map_camera, extrinsics)
                 if self._track:
                     self._inputs.take_answer(T_map_camera, nanoseconds(header.stamp), query.prior)
             self._publishers.publish_pictures(trace, header)
-        return JobResult(outcome, pose)
+        return JobResult(outcome, answer)

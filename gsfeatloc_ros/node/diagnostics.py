@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 
 from builtin_interfaces.msg import Time
@@ -9,6 +10,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 
 from gsfeatloc_ros.localize.estimate import Estimate
+from gsfeatloc_ros.localize.protection import ProtectionLevel
 from gsfeatloc_ros.node.qos import RELIABLE
 from gsfeatloc_ros.ros_io.outcome import OutcomeStatus
 
@@ -34,6 +36,14 @@ def stamp_text(stamp: Time) -> str:
 def estimate_texts(estimate: Estimate) -> dict[str, str]:
     """Return the evidence and the times of an estimate by key."""
     return estimate.evidence.texts() | stage_texts(estimate)
+
+
+def protection_texts(level: ProtectionLevel) -> dict[str, str]:
+    """Return how far an answer may be off, by key: map units, degrees."""
+    return {
+        "protection_radius": f"{level.radius:.2g}",
+        "protection_angle_deg": f"{math.degrees(level.angle):.2g}",
+    }
 
 
 def stage_texts(estimate: Estimate) -> dict[str, str]:

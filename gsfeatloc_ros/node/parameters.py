@@ -11,8 +11,12 @@ from rclpy.parameter import Parameter as RosParameter
 from gsfeatloc_ros.common.parameter import Parameter
 from gsfeatloc_ros.node.settings import PARAMETERS, Settings
 
-# New names by old ones, which still work for one release.
-_RENAMED = {"localizer.min_agreement": "localizer.min_correlation"}
+# Names that are accepted for one more release, though they have no effect, and what to set instead.
+_RETIRED = {
+    "localizer.min_inlier_ratio": "localizer.max_risk",
+    "localizer.min_correlation": "localizer.max_risk",
+    "localizer.min_agreement": "localizer.max_risk",
+}
 
 _BY_NAME = {parameter.name: parameter for parameter in PARAMETERS}
 
@@ -42,8 +46,10 @@ def declare_parameters(node: Node) -> Settings:
         # Lists are tuples in settings, of which rclpy knows nothing.
         default = list(parameter.default) if isinstance(parameter.default, tuple) else parameter.default
         node.declare_parameter(parameter.name, default, descriptor(parameter))
-    for old, new in _RENAMED.items():
-        _take_old_name(node, old, new)
+    for name in _RETIRED:
+        if node.declare_parameter(name, descriptor=ParameterDescriptor(dynamic_typing=True)).value is not None:
+            _warn_of_retired(node, name)
+        node.undeclare_parameter(name)
     check_choices([node.get_parameter(name) for name in _BY_NAME])
     return read_settings(node)
 
@@ -62,31 +68,17 @@ def check_choices(parameters: Sequence[RosParameter]) -> None:
             _BY_NAME[parameter.name].check(parameter.value)
 
 
-def with_new_names(node: Node, parameters: Sequence[RosParameter]) -> list[RosParameter]:
-    """Return parameters that are about to be set, with new names in place of old ones, of which the node warns."""
-    renamed = []
+def without_retired(node: Node, parameters: Sequence[RosParameter]) -> list[RosParameter]:
+    """Return parameters that are about to be set, but for those without effect, of which the node warns."""
+    kept = []
     for parameter in parameters:
-        name = _RENAMED.get(parameter.name, parameter.name)
-        if name != parameter.name:
-            node.get_logger().warning(f"parameter {parameter.name} is now {name}: set that")
-        renamed.append(RosParameter(name, parameter.type_, parameter.value))
-    return renamed
+        if parameter.name in _RETIRED:
+            _warn_of_retired(node, parameter.name)
+        else:
+            kept.append(parameter)
+    # rclpy says that setting no parameter fails: what was to be set instead stays as it is.
+    return kept or [node.get_parameter(_RETIRED[parameter.name]) for parameter in parameters[:1]]
 
 
-def _take_old_name(node: Node, old: str, new: str) -> None:
-    """Use a value that was given under an old name, unless one was given under the new name.
-
-    What is the default counts as not given: the file of parameters that the launch file passes has it.
-    """
-    value = node.declare_parameter(old, descriptor=ParameterDescriptor(dynamic_typing=True)).value
-    node.undeclare_parameter(old)
-    if value is None:
-        return
-    given = node.get_parameter(new).value
-    if given != _BY_NAME[new].default:
-        node.get_logger().warning(f"parameter {old} is now {new}, which is {given}: {old} does not count, remove it")
-        return
-    node.get_logger().warning(f"parameter {old} is now {new}: rename it; until the next release its value is used")
-    result = node.set_parameters([RosParameter(new, value=value)])[0]
-    if not result.successful:
-        raise ValueError(f"parameter {old}: {result.reason}")
+def _warn_of_retired(node: Node, name: str) -> None:
+    node.get_logger().warning(f"parameter {name} has no effect any more: set {_RETIRED[name]} instead, and remove it")

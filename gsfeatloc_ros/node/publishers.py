@@ -1,4 +1,4 @@
-"""What is published when an image was localized, or was not: the pose, tf, pictures."""
+"""What is published when an image was localized, or was not: the pose, how far it may be off, tf, pictures."""
 
 from __future__ import annotations
 
@@ -14,7 +14,9 @@ from std_msgs.msg import Header
 
 from gsfeatloc_ros.common.geometry import shift_covariance
 from gsfeatloc_ros.localize.estimate import Estimate, Trace
-from gsfeatloc_ros.node.encode import image_message, pose_message
+from gsfeatloc_ros.localize.protection import ProtectionLevel, protection_level
+from gsfeatloc_ros.node.encode import image_message, pose_message, protection_message
+from gsfeatloc_ros.node.interfaces import ProtectionLevelMessage
 from gsfeatloc_ros.node.qos import LATCHED, RELIABLE, overridable
 from gsfeatloc_ros.node.settings import BASE, Settings
 from gsfeatloc_ros.node.transforms import Transforms
@@ -38,8 +40,21 @@ class Extrinsics:
     T_camera_odom: np.ndarray | None
 
 
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """An answer as it is published: of the camera, or of the base.
+
+    Attributes:
+        pose: with its covariance.
+        protection: how far the pose may be off.
+    """
+
+    pose: PoseWithCovarianceStamped
+    protection: ProtectionLevel
+
+
 class Publishers:
-    """Publishes on the topics pose, rendered_image and debug_image, and the transform from the map to the odometry.
+    """Publishes on the node's topics, and the transform from the map to the odometry.
 
     Args:
         node: whose they are.
@@ -72,8 +87,14 @@ class Publishers:
         self._pose = node.create_publisher(
             PoseWithCovarianceStamped, "pose", LATCHED, qos_overriding_options=overridable()
         )
+        self._protection = None
+        if ProtectionLevelMessage is not None:
+            self._protection = node.create_publisher(
+                ProtectionLevelMessage, "protection_level", LATCHED, qos_overriding_options=overridable()
+            )
         self._render = node.create_publisher(Image, "rendered_image", RELIABLE, qos_overriding_options=overridable())
         self._debug = node.create_publisher(Image, "debug_image", RELIABLE, qos_overriding_options=overridable())
+        self._changed = node.create_publisher(Image, "~/changed", RELIABLE, qos_overriding_options=overridable())
         self._timer = node.create_timer(_TRANSFORM_PERIOD, self._broadcast) if self._odom_frame else None
 
     @property
@@ -83,8 +104,9 @@ class Publishers:
 
     def close(self) -> None:
         """Publish nothing more."""
-        for publisher in (self._pose, self._render, self._debug):
-            self._node.destroy_publisher(publisher)
+        for publisher in (self._pose, self._protection, self._render, self._debug, self._changed):
+            if publisher is not None:
+                self._node.destroy_publisher(publisher)
         if self._timer:
             self._node.destroy_timer(self._timer)
 
@@ -103,36 +125,44 @@ class Publishers:
             T_camera_odom = self._transforms.lookup(camera_frame, self._odom_frame, stamp)
         return Extrinsics(T_camera_body, T_camera_odom)
 
-    def pose_message(
-        self, estimate: Estimate, extrinsics: Extrinsics, header: Header
-    ) -> PoseWithCovarianceStamped | None:
+    def answer(self, estimate: Estimate, extrinsics: Extrinsics, header: Header) -> Answer | None:
         """Return the answer to the image of a header; None where the estimate is none."""
         if estimate.T_map_camera is None or estimate.covariance is None:
             return None
         T_map_body = estimate.T_map_camera @ extrinsics.T_camera_body
         lever = T_map_body[:3, 3] - estimate.T_map_camera[:3, 3]
         covariance = shift_covariance(estimate.covariance, lever)
-        return pose_message(T_map_body, covariance, Header(stamp=header.stamp, frame_id=self._map_frame))
+        pose = pose_message(T_map_body, covariance, Header(stamp=header.stamp, frame_id=self._map_frame))
+        return Answer(pose, protection_level(covariance))
 
-    def publish_pose(self, pose: PoseWithCovarianceStamped, T_map_camera: np.ndarray, extrinsics: Extrinsics) -> None:
+    def publish_answer(self, answer: Answer, T_map_camera: np.ndarray, extrinsics: Extrinsics) -> None:
         """Publish an answer, and from now on the transform that follows from it.
 
         Args:
-            pose: of pose_message.
+            answer: to publish.
             T_map_camera: (4, 4).
             extrinsics: at the image's stamp.
         """
-        self._pose.publish(pose)
-        self.last_stamp = nanoseconds(pose.header.stamp)
+        header = answer.pose.header
+        self._pose.publish(answer.pose)
+        if self._protection is not None:
+            self._protection.publish(protection_message(answer.protection, header))
+        self.last_stamp = nanoseconds(header.stamp)
         if extrinsics.T_camera_odom is not None:
             self._T_map_odom = T_map_camera @ extrinsics.T_camera_odom
             self._broadcast()
 
     def publish_pictures(self, trace: Trace, header: Header) -> None:
-        """Publish the map seen from an answer, and how the image was localized or why not, if somebody subscribes."""
+        """Publish what there is to see of an image, each picture if somebody subscribes.
+
+        They are the map seen from an answer; where the photo shows something else than the map, if a pose was found;
+        and how the image was localized or why not.
+        """
         localized, render = trace.estimate.localized, trace.render
         if localized and render is not None and self._render.get_subscription_count() > 0:
             self._render.publish(image_message(render.image(), header))
+        if trace.changed is not None and self._changed.get_subscription_count() > 0:
+            self._changed.publish(image_message(trace.changed(), header))
         if self._debug.get_subscription_count() > 0:
             self._debug.publish(image_message(draw(trace), header))
 

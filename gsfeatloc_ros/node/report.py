@@ -9,7 +9,19 @@ from dataclasses import dataclass
 
 from builtin_interfaces.msg import Time
 
-from gsfeatloc_ros.node.diagnostics import ERROR, LEVELS, OK, WARN, Reporter, estimate_texts, stage_texts, stamp_text
+from gsfeatloc_ros.localize.protection import ProtectionLevel
+from gsfeatloc_ros.node.diagnostics import (
+    ERROR,
+    LEVELS,
+    OK,
+    WARN,
+    Reporter,
+    estimate_texts,
+    protection_texts,
+    stage_texts,
+    stamp_text,
+)
+from gsfeatloc_ros.ros_io.camera_health import CameraHealth
 from gsfeatloc_ros.ros_io.outcome import Outcome, OutcomeStatus
 
 # Seconds over which rates and shares are counted, and most images and attempts in them.
@@ -108,6 +120,7 @@ class Report:
 
     Attributes:
         health: of the session.
+        camera: what is known of the calibration of the camera on the topic.
         images: number of images that came.
         answers: number of answers that were published.
     """
@@ -116,6 +129,7 @@ class Report:
         self._reporter = reporter
         self._dropped = dropped
         self.health = Health()
+        self.camera = CameraHealth()
         self.images = 0
         self.answers = 0
 
@@ -138,12 +152,15 @@ class Report:
             stamped = {"stamp": stamp_text(stamp)} if stamp else {}
             self._diagnose(ERROR, OutcomeStatus.REFUSED.value, reason, stamped)
 
-    def publish_attempt(self, stamp: Time, outcome: Outcome, traceback: str = "") -> None:
+    def publish_attempt(
+        self, stamp: Time, outcome: Outcome, protection: ProtectionLevel | None, traceback: str = ""
+    ) -> None:
         """Publish, and log unless it ended well, what came of the image of a stamp.
 
         Args:
             stamp: of the image.
             outcome: what came of it.
+            protection: how far the answer may be off; None where there is none.
             traceback: of the exception, if that is what came of it.
         """
         if outcome.status is OutcomeStatus.ERROR:
@@ -152,12 +169,16 @@ class Report:
             self._reporter.warn(outcome.status.value, outcome.reason)
         self.health.count_attempt(outcome)
         texts = {} if outcome.estimate is None else estimate_texts(outcome.estimate)
-        values = {"stamp": stamp_text(stamp)} | texts
+        values = {"stamp": stamp_text(stamp)} | texts | (protection_texts(protection) if protection else {})
         self._diagnose(LEVELS[outcome.status], outcome.status.value, outcome.reason, values)
 
     def publish_health(self, level: bytes, reason: str, about: dict[str, str]) -> None:
-        """Publish how the session does, with what there is to know about it."""
-        self._reporter.diagnose("health", level, reason, about | self.health.texts() | self._counts)
+        """Publish how the session does, with what there is to know about it; a wrong calibration explains much."""
+        warning = self.camera.warning
+        if warning and level != ERROR:
+            level, reason = WARN, warning
+        texts = about | self.health.texts() | self.camera.texts()
+        self._reporter.diagnose("health", level, reason, texts | self._counts)
 
     def _diagnose(self, level: bytes, status: str, reason: str, values: dict[str, str]) -> None:
         said = {"status": status, "reason": reason}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from concurrent.futures import Future
 from typing import Any
@@ -13,15 +14,11 @@ from std_srvs.srv import Trigger
 
 from gsfeatloc_ros.common.stage_clock import Interrupted
 from gsfeatloc_ros.node.attempts import Attempts, Job, JobResult
+from gsfeatloc_ros.node.interfaces import LocalizeImage
 from gsfeatloc_ros.node.session import Session
 from gsfeatloc_ros.ros_io.decode import decode_camera, validate_image
 from gsfeatloc_ros.ros_io.outcome import Outcome, OutcomeStatus
 from gsfeatloc_ros.ros_io.prior import PriorSource, decode_prior
-
-try:
-    from gsfeatloc_interfaces.srv import LocalizeImage
-except ImportError:  # the package is optional: interfaces/ is built apart
-    LocalizeImage = None
 
 _UNCONFIGURED = "the node is not configured: configure and activate it (ros2 lifecycle set ... configure)"
 _INACTIVE = "the node is not active: activate it (ros2 lifecycle set ... activate)"
@@ -48,7 +45,8 @@ class Services:
         node.create_service(Trigger, "~/relocalize", self._on_relocalize, callback_group=group)
         if LocalizeImage is None:
             node.get_logger().info(
-                "the service ~/localize_image is off: build the package gsfeatloc_interfaces (interfaces/), source it"
+                "the service ~/localize_image and the topic protection_level are off: build the package "
+                "gsfeatloc_interfaces (interfaces/), source it"
             )
         else:
             node.create_service(LocalizeImage, "~/localize_image", self._on_localize_image, callback_group=group)
@@ -60,7 +58,7 @@ class Services:
             result = await self._result(session.attempts, session.reception.newest())
         except ValueError as error:
             result = JobResult(Outcome.refused(error))
-        response.success, response.message = result.pose is not None, result.outcome.reason
+        response.success, response.message = result.answer is not None, result.outcome.reason
         return response
 
     async def _on_localize_image(self, request: Any, response: Any) -> Any:
@@ -70,7 +68,7 @@ class Services:
             result = await self._result(session.attempts, _requested_job(request, session))
         except ValueError as error:
             result = JobResult(Outcome.refused(error))
-        outcome = result.outcome
+        outcome, answer = result.outcome, result.answer
         response.status = {
             OutcomeStatus.LOCALIZED: response.LOCALIZED,
             OutcomeStatus.REJECTED: response.REJECTED,
@@ -79,11 +77,14 @@ class Services:
             OutcomeStatus.ERROR: response.ERROR,
         }[outcome.status]
         response.reason = outcome.reason
+        response.probability_wrong = response.protection_radius = response.protection_angle = math.nan
         if outcome.estimate is not None:
             response.inliers = outcome.estimate.evidence.inliers
             response.milliseconds = outcome.estimate.milliseconds["total"]
-        if result.pose is not None:
-            response.pose = result.pose
+            response.probability_wrong = outcome.estimate.evidence.probability_wrong
+        if answer is not None:
+            response.pose = answer.pose
+            response.protection_radius, response.protection_angle = answer.protection.radius, answer.protection.angle
         return response
 
     def _active_session(self) -> Session:

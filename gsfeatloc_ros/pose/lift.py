@@ -24,10 +24,14 @@ class LiftOptions:
     Attributes:
         min_alpha: least coverage of each neighbour.
         max_depth_step: largest step of depth between them, relative to the depth: it tells a slope from an edge.
+        max_depth_spread: largest spread of the depths that made the pixel, relative to the median. Of two layers, the
+            spread is at most half of the farther one's depth: where it is more than half of the median, the median is
+            that of a haze in front of what is seen.
     """
 
     min_alpha: float = 0.8
     max_depth_step: float = 0.1
+    max_depth_spread: float = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,10 +67,12 @@ def lift(render: Render, camera: Camera, T_map_camera: np.ndarray, pixels: np.nd
 
     depths, depth_stds, alphas = _sampled(render, rows, columns)  # (M, 4) each, NaN where there is none
     depth = (weights * depths).sum(axis=1)
-    depth_std = np.minimum((weights * depth_stds).sum(axis=1), MAX_DEPTH_STD * depth)
+    spread = (weights * depth_stds).sum(axis=1)
+    depth_std = np.minimum(spread, MAX_DEPTH_STD * depth)
     # Comparisons with NaN are false: what has no depth is not valid.
     one_surface = depths.max(axis=1) - depths.min(axis=1) <= options.max_depth_step * depth
-    valid = inside & (alphas.min(axis=1) >= options.min_alpha) & one_surface
+    seen_surface = spread <= options.max_depth_spread * depth
+    valid = inside & (alphas.min(axis=1) >= options.min_alpha) & one_surface & seen_surface
     depth = np.where(valid, depth, np.nan)
     rays = camera.rays(pixels)
     points = transform(T_map_camera, rays * depth[:, None])

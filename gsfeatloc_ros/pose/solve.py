@@ -5,6 +5,7 @@ PoseLib was chosen over OpenCV's USAC by measurement: `python -m gsfeatloc_ros.t
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -22,6 +23,11 @@ MIN_POINTS = 4
 _MIN_PIXEL_SIGMA = 0.1
 _REFINE_ITERATIONS = 20
 _NOISE_ITERATIONS = 5
+# Matches nearer to each other than this, in pixels, are neighbours; all pairs of at most so many are looked at.
+_NEIGHBOUR_DISTANCE = 25.0
+_MAX_PAIRED = 400
+# Poses that are not plausible are passed over, with their inliers, this many times.
+_MAX_IMPLAUSIBLE_POSES = 3
 # A step that lowers the cost by less than this share ends the refinement: a thousandth of a standard deviation is left.
 _CONVERGED = 1e-7
 
@@ -35,13 +41,15 @@ class PoseOptions:
             it is narrow.
         shared_error: pixels of error that all matches have in common (errors of the map, of its poses, of the
             calibration), which does not average out over them. Fitted on real photos: docs/trust.md.
+        shared_share: share of the variance that neighbouring residuals have in common which all matches have.
     """
 
     max_reprojection_error: float = parameter(
         3.0, "Pixels of the resized image within which a corner agrees with a pose.", (0.1, 50.0), live=True
     )
     cauchy_scale: float = 1.0
-    shared_error: float = 0.1
+    shared_error: float = 0.08
+    shared_share: float = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +90,13 @@ class PoseSolution:
     reprojection_error: float
 
 
-def solve_pose(camera: Camera, found: Correspondences, options: PoseOptions, seed: int) -> PoseSolution | None:
+def solve_pose(
+    camera: Camera,
+    found: Correspondences,
+    options: PoseOptions,
+    seed: int,
+    plausible: Callable[[np.ndarray], bool] = lambda pose: True,
+) -> PoseSolution | None:
     """Find the pose from which the points are seen at the pixels.
 
     Args:
@@ -90,10 +104,35 @@ def solve_pose(camera: Camera, found: Correspondences, options: PoseOptions, see
         found: correspondences.
         options: of the solver.
         seed: of RANSAC's sampling.
+        plausible: whether a pose (4, 4) may be the one that is looked for. If not, as when something in the photo is
+            seen somewhere else in the map, a pose that is is looked for in the matches that do not agree with it.
 
     Returns:
-        The solution, or None where fewer than MIN_POINTS matches agree on a pose.
+        The solution, one that is not plausible where there is no other; None where fewer than MIN_POINTS matches agree
+        on a pose.
     """
+    first: PoseSolution | None = None
+    others = np.arange(len(found.pixels))
+    for _ in range(_MAX_IMPLAUSIBLE_POSES + 1):
+        solved = _solve(camera, found.select(others), options, seed)
+        if solved is None:
+            break
+        T_map_camera, covariance = solved
+        errors = reprojection_errors(camera, T_map_camera, found)
+        inliers = errors <= options.max_reprojection_error
+        rms = float(np.sqrt(np.mean(errors[inliers] ** 2)))
+        solution = PoseSolution(T_map_camera, covariance, errors, inliers, rms)
+        if plausible(T_map_camera):
+            return solution
+        first = first or solution
+        others = others[~inliers[others]]
+    return first
+
+
+def _solve(
+    camera: Camera, found: Correspondences, options: PoseOptions, seed: int
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return the pose (4, 4) that most matches agree on, and its covariance (6, 6), or None."""
     sampled = ransac_pose(camera, found, options.max_reprojection_error, seed)
     if sampled is None:
         return None
@@ -101,12 +140,8 @@ def solve_pose(camera: Camera, found: Correspondences, options: PoseOptions, see
     refined = refine_pose(camera, start, found.select(inliers), options)
     if refined is None:
         return None
-    T_map_camera, covariance = refined
-    errors = reprojection_errors(camera, T_map_camera, found)
-    inliers = errors <= options.max_reprojection_error
-    if inliers.sum() < MIN_POINTS:
-        return None
-    return PoseSolution(T_map_camera, covariance, errors, inliers, float(np.sqrt(np.mean(errors[inliers] ** 2))))
+    agreeing = reprojection_errors(camera, refined[0], found) <= options.max_reprojection_error
+    return refined if agreeing.sum() >= MIN_POINTS else None
 
 
 def ransac_pose(
@@ -206,8 +241,33 @@ def refine_pose(
     inflation = max((weights * squared).sum() / degrees_of_freedom, 1.0)
     weighted = (weights[:, None, None] * linear.by_pose).reshape(-1, 6)
     information_of_a_match = weighted.T @ linear.by_pose.reshape(-1, 6) / weights.sum()
-    shared = options.shared_error**2 * np.linalg.inv(information_of_a_match)
+    shared = shared_variance(found.pixels, linear.residuals, options) * np.linalg.inv(information_of_a_match)
     return pose, covariance * inflation + shared
+
+
+def shared_variance(pixels: np.ndarray, residuals: np.ndarray, options: PoseOptions) -> float:
+    """Return the variance, in square pixels along an axis, of the error that all matches have in common.
+
+    Args:
+        pixels: (M, 2) of the matches.
+        residuals: (M, 2). Those of neighbours are alike where the map is bent, or the photo blurred, or the lens not as
+            it was calibrated.
+        options: how much of that is taken to be common to all.
+    """
+    step = 1 + len(pixels) // _MAX_PAIRED
+    pixels, residuals = pixels[::step], residuals[::step]
+    squares = (pixels**2).sum(axis=1)
+    near = squares[:, None] + squares - 2 * pixels @ pixels.T < _NEIGHBOUR_DISTANCE**2
+    np.fill_diagonal(near, False)
+    pairs = near.sum()
+    alike = 0.5 * float((near * (residuals @ residuals.T)).sum()) / pairs if pairs else 0.0
+    return options.shared_error**2 + options.shared_share * max(alike, 0.0)
+
+
+def whiten(camera: Camera, T_map_camera: np.ndarray, found: Correspondences) -> np.ndarray | None:
+    """Return matrices (M, 2, 2) that whiten the residuals at a pose (4, 4); None where a point is not ahead of it."""
+    linear = _linearize(camera, T_map_camera, found)
+    return None if linear is None else _whitening(linear.residuals, _apply(linear.by_point, found.sigmas))
 
 
 class _Linear(NamedTuple):

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from gsfeatloc_ros.localize.estimate import Estimate, Status, Trace
+from gsfeatloc_ros.localize.protection import protection_level
 from gsfeatloc_ros.match.base import Matches
 from gsfeatloc_ros.ros_io.outcome import OutcomeStatus
 
@@ -33,9 +34,10 @@ _MARGIN = 12
 _STATUS_WIDTH = 104
 _LINE_HEIGHT = 20
 _ROW_HEIGHT = 42
-# Fields take whole columns: numbers stay in their places from picture to picture.
+# Fields take whole columns: numbers stay in their places from picture to picture. The evidence has two rows of them.
 _COLUMN_WIDTH = 104
 _COLUMN_GAP = 12
+_EVIDENCE_ROWS = 2
 # Room kept for the reason: nearly all pictures are of one height, as recorders of video want them.
 _MIN_REASON_LINES = 2
 
@@ -48,8 +50,8 @@ def draw(trace: Trace) -> np.ndarray:
 
     The photo stands beside the last render that it was compared with. Inliers have a ring at both ends, in a colour
     that goes with their place in the photo, and some of them a line. Below are the status, the reason, the evidence,
-    milliseconds by stage and the pose's standard deviations (along and about the axes of the map frame; map units,
-    degrees).
+    the protection level, milliseconds by stage and the pose's standard deviations (along and about the axes of the map
+    frame; map units, degrees).
 
     Returns:
         (H, 1280, 3) uint8 RGB.
@@ -64,7 +66,7 @@ def draw(trace: Trace) -> np.ndarray:
         # The render is of the photo's size where there are inliers.
         _draw_matches(pair, trace.correspondences, left.shape[1] / photo.shape[1])
     times = [(name, f"{ms:.0f} ms") for name, ms in estimate.milliseconds.items()]
-    rows = [_evidence(estimate), times + _deviations(estimate)]
+    rows = [*_evidence_rows(estimate), times + _deviations(estimate)]
     return _with_words(pair, estimate.status.value, _COLOURS[estimate.status], estimate.reason, rows)
 
 
@@ -72,7 +74,7 @@ def draw_refused(photo: np.ndarray, reason: str) -> np.ndarray:
     """Draw a photo (H, W, 3) uint8 RGB of any size that was not tried, and why; of the same layout as `draw`."""
     left = _resized(photo, _size(photo))
     pair = np.hstack([left, _black(left, "not tried")])
-    return _with_words(pair, OutcomeStatus.REFUSED.value, _RED, reason, [[], []])
+    return _with_words(pair, OutcomeStatus.REFUSED.value, _RED, reason, [[]] * (_EVIDENCE_ROWS + 1))
 
 
 def _size(photo: np.ndarray) -> tuple[int, int]:
@@ -125,10 +127,27 @@ def _one_a_cell(places: np.ndarray) -> np.ndarray:
     return np.unique(rows * _LINE_CELLS[0] + columns, return_index=True)[1]
 
 
-def _evidence(estimate: Estimate) -> list[Field]:
-    return [
+def _evidence_rows(estimate: Estimate) -> list[list[Field]]:
+    """Return the evidence and the protection level in rows that are full, as many as there always are."""
+    fields = [
         (name.replace("_", " "), "-" if text == "nan" else text) for name, text in estimate.evidence.texts().items()
     ]
+    if estimate.covariance is not None:
+        level = protection_level(estimate.covariance)
+        fields.append(("protection level", f"{level.radius:.2g}, {np.degrees(level.angle):.2g} deg"))
+    rows: list[list[Field]] = [[]]
+    for field in fields:
+        if sum(map(_field_width, rows[-1])) + _field_width(field) > _WIDTH - 2 * _MARGIN + _COLUMN_GAP:
+            rows.append([])
+        rows[-1].append(field)
+    return rows + [[]] * (_EVIDENCE_ROWS - len(rows))
+
+
+def _field_width(field: Field) -> int:
+    """Return the pixels that a field takes in its row, in whole columns."""
+    name, value = field
+    width = max(_text_width(name, _LABEL_SIZE), _text_width(value)) + _COLUMN_GAP
+    return -(-width // _COLUMN_WIDTH) * _COLUMN_WIDTH
 
 
 def _deviations(estimate: Estimate) -> list[Field]:
@@ -164,8 +183,7 @@ def _with_words(
         for name, value in row:
             _write(band, name, (left, top + 16), _LABEL_SIZE, _LABEL)
             _write(band, value, (left, top + 34), _TEXT_SIZE, _TEXT)
-            width = max(_text_width(name, _LABEL_SIZE), _text_width(value)) + _COLUMN_GAP
-            left += -(-width // _COLUMN_WIDTH) * _COLUMN_WIDTH
+            left += _field_width((name, value))
     for caption, left in (("photo", 0), ("render", pair.shape[1] // 2)):
         cv2.rectangle(pair, (left, 0), (left + 2 * _MARGIN + _text_width(caption), 24), _BACKGROUND, cv2.FILLED)
         _write(pair, caption, (left + _MARGIN, 17), _TEXT_SIZE, _TEXT)

@@ -15,7 +15,7 @@ from gsfeatloc_ros.common.geometry import invert, rotate_covariance, shift_covar
 from gsfeatloc_ros.ros_io.decode import decode_camera, decode_picture, decode_pose, nanoseconds, picture_size
 from gsfeatloc_ros.ros_io.message_types import AnyImage
 from gsfeatloc_ros.ros_io.message_types import Odometry as OdometryMessage
-from gsfeatloc_ros.ros_io.odometry import Odometry
+from gsfeatloc_ros.ros_io.odometry import OdometryBuffer
 from gsfeatloc_ros.ros_io.prior import Prior, PriorPolicy, PriorSource, decode_prior
 
 T = TypeVar("T")
@@ -183,8 +183,8 @@ class Inputs:
         with self._prior_lock:
             self._prior = newest
 
-    def _no_odometry(self) -> Odometry:
-        return Odometry(self.policy.odometry_max_age + _MAX_IMAGE_DELAY)
+    def _no_odometry(self) -> OdometryBuffer:
+        return OdometryBuffer(self.policy.odometry_max_age + _MAX_IMAGE_DELAY)
 
     def _take_odometry(self, message: OdometryMessage) -> None:
         pose = decode_pose(message, InputTopic.ODOMETRY.value)

@@ -15,7 +15,7 @@ _MAX_DISTANCE = 200_000_000
 _MAX_DISORDER = 1_000_000_000
 
 
-class Odometry:
+class OdometryBuffer:
     """The newest poses of a body in its odometry frame; may be filled and read by different threads.
 
     Args:

@@ -3,6 +3,7 @@
     python -m gsfeatloc_ros.tools.evaluate SCENE --method default --matcher xfeat --json result.json
     python -m gsfeatloc_ros.tools.evaluate SCENE... --method default,published --matcher sift,xfeat --seed 0-9 \\
         --jobs 4 --report report
+    python -m gsfeatloc_ros.tools.evaluate SCENE... --suite trust --jobs 2 --report trust
 
 SCENE is a folder with photos and their poses (nerfstudio's transforms.json, NeRF-Synthetic or a COLMAP model) and a
 map. Where options name several scenes, methods, matchers, sigmas or seeds, all combinations are run. A query that was
@@ -12,6 +13,7 @@ not answered has the errors of its prior.
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import shlex
 import sys
@@ -22,13 +24,16 @@ from tqdm import tqdm
 
 from gsfeatloc_ros.evaluate.ablation import ABLATIONS
 from gsfeatloc_ros.evaluate.corruptions import CORRUPTIONS
+from gsfeatloc_ros.evaluate.degradations import DEGRADATIONS
 from gsfeatloc_ros.evaluate.plan import Combinations, Evaluation
 from gsfeatloc_ros.evaluate.protocol import PROTOCOLS
 from gsfeatloc_ros.evaluate.record import Record
 from gsfeatloc_ros.evaluate.run import METHODS, PRIORS_FILE
+from gsfeatloc_ros.evaluate.suites import SUITES, Condition
 from gsfeatloc_ros.evaluate.tables import RunResults, describe, over_seeds, query_table, run_summary, run_table
+from gsfeatloc_ros.evaluate.trust import describe_trust, trust_table
 from gsfeatloc_ros.match import DEFAULT_MATCHER, MATCHERS
-from gsfeatloc_ros.tools.options import Settings, add_old_name, localizer_options, number, setting
+from gsfeatloc_ros.tools.options import CollectSettings, add_old_name, localizer_options, number, setting
 
 _NOTHING = "nothing"
 
@@ -44,7 +49,10 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         results = _evaluate(options)
         if options.json:
-            options.json.write_text(json.dumps(describe(results), indent=2, allow_nan=False) + "\n", encoding="utf-8")
+            content = describe(results)
+            if options.suite:
+                content["trust"] = describe_trust(over_seeds(results))
+            options.json.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
         if options.report:
             from gsfeatloc_ros.evaluate.report import write_report
 
@@ -73,7 +81,9 @@ def _evaluate(options: argparse.Namespace) -> list[RunResults]:
             progress.set_description(f"{task.run.scene.name} {task.run.method} {task.run.matcher}", refresh=False)
             progress.update()
     results = evaluation.results()
-    if len(results) == 1:
+    if options.suite:
+        print(trust_table(over_seeds(results)))
+    elif len(results) == 1:
         print(query_table(results[0].results))
         print(run_summary(describe(results)))
     else:
@@ -97,7 +107,7 @@ def _combinations(options: argparse.Namespace) -> Combinations:
             (scene.resolve(), map_path and map_path.resolve())
             for scene, map_path in zip(options.scene, maps, strict=True)
         ],
-        protocols=options.protocol,
+        conditions=_conditions(options),
         priors_file=options.priors and options.priors.resolve(),
         methods=options.method,
         matchers=options.matcher,
@@ -106,8 +116,17 @@ def _combinations(options: argparse.Namespace) -> Combinations:
         max_width=options.max_width,
         options=options.set,
         ablations=[name.replace(_NOTHING, "") for name in options.ablation],
-        corruptions=[name.replace(_NOTHING, "") for name in options.corruption],
     )
+
+
+def _conditions(options: argparse.Namespace) -> list[Condition]:
+    """Return what the options do to photos, priors and maps."""
+    if options.suite:
+        return list(SUITES[options.suite])
+    corruptions, degradations = (
+        [name.replace(_NOTHING, "") for name in names] for names in (options.corruption, options.degrade)
+    )
+    return [Condition(*names) for names in itertools.product(options.protocol, corruptions, degradations)]
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -155,7 +174,7 @@ def _parser() -> argparse.ArgumentParser:
         "--set",
         type=setting(_list),
         default={},
-        action=Settings,
+        action=CollectSettings,
         metavar="OPTION=LIST",
         help=f"change an option of method default: {', '.join(localizer_options())}",
     )
@@ -175,6 +194,18 @@ def _parser() -> argparse.ArgumentParser:
         help=f"make the photos worse, one way at a time: {', '.join(CORRUPTIONS)} (default: {_NOTHING})",
     )
     add_old_name(parser, corruption, "--spoil")
+    parser.add_argument(
+        "--degrade",
+        type=_names((_NOTHING, *DEGRADATIONS)),
+        default=[_NOTHING],
+        metavar="LIST",
+        help=f"make the map worse, one way at a time: {', '.join(DEGRADATIONS)} (default: {_NOTHING})",
+    )
+    parser.add_argument(
+        "--suite",
+        choices=SUITES,
+        help="trust: right photos, all corruptions, degraded maps, and photos that are not of the scene",
+    )
     parser.add_argument("--limit", type=number(int, 0), default=0, help="only the first photos; 0 for all")
     parser.add_argument(
         "--max-width", type=number(int, 1), default=640, help="resize wider photos (default: %(default)s)"
@@ -192,6 +223,9 @@ def _check(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None
             parser.error(f"{name} {path}: there is no folder {path.absolute().parent}")
     if options.map and len(options.map) != len(options.scene):
         parser.error(f"--map: {len(options.map)} maps for {len(options.scene)} scenes")
+    own = ("protocol", "corruption", "degrade")
+    if options.suite and (chosen := [name for name in own if getattr(options, name) != parser.get_default(name)]):
+        parser.error(f"--suite {options.suite} has its own --{chosen[0]}")
     if (options.priors is not None) != (PRIORS_FILE in options.protocol):
         parser.error(f"--priors and --protocol {PRIORS_FILE} need each other")
 

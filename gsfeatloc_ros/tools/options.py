@@ -13,11 +13,14 @@ from gsfeatloc_ros.localize.options import LocalizerOptions
 
 # Have options of the commands of their own.
 _OWN_OPTIONS = ("max_image_width", "seed")
-# New names of localizer options by their old ones, which work until the next release.
-_RENAMED = {"min_agreement": "min_correlation"}
+# Localizer options that are gone, and what to use instead.
+_RETIRED = dict.fromkeys(
+    ("min_inlier_ratio", "min_correlation", "min_agreement"),
+    "max_risk, the largest probability that an answer is wrong",
+)
 
 
-class Settings(argparse.Action):
+class CollectSettings(argparse.Action):
     """Collect pairs of a name and a value in a dictionary."""
 
     def __call__(
@@ -51,9 +54,8 @@ def setting(parse: Callable[[Callable[[str], float]], Callable[[str], Any]]) -> 
 
     def parse_setting(text: str) -> tuple[str, Any]:
         name, equals, value = text.partition("=")
-        if equals and name in _RENAMED:
-            _warn_of_old_name(f"option {name}", _RENAMED[name])
-            name = _RENAMED[name]
+        if name in _RETIRED:
+            raise argparse.ArgumentTypeError(f"{name} is no option any more: use {_RETIRED[name]}")
         if not equals or name not in kinds:
             raise argparse.ArgumentTypeError(f"{text} is not OPTION=VALUE with an option out of {', '.join(kinds)}")
         return name, parse(number(kinds[name], -math.inf))(value)
@@ -93,7 +95,8 @@ def add_old_name(parser: argparse.ArgumentParser, option: argparse.Action, old: 
             values: str | Sequence[Any] | None,
             option_string: str | None = None,
         ) -> None:
-            _warn_of_old_name(old, option.option_strings[0])
+            new = option.option_strings[0]
+            print(f"{old} is now {new}; the old name works until the next release", file=sys.stderr)
             setattr(namespace, self.dest, values)
 
     parser.add_argument(
@@ -104,7 +107,3 @@ def add_old_name(parser: argparse.ArgumentParser, option: argparse.Action, old: 
         default=argparse.SUPPRESS,
         help=argparse.SUPPRESS,
     )
-
-
-def _warn_of_old_name(old: str, new: str) -> None:
-    print(f"{old} is now {new}; the old name works until the next release", file=sys.stderr)

@@ -39,7 +39,8 @@ while it runs:
 A double needs its point (`5.0`, not `5`). What is of another type, out of range or none of the choices is refused with
 the reason. Only `map.path` has to be given.
 
-`localizer.min_agreement` is now `localizer.min_correlation`; the old name works until the next release, with a warning.
+`localizer.min_inlier_ratio`, `localizer.min_correlation` and `localizer.min_agreement` have no effect any more; until
+the next release they are accepted, with a warning. Set `localizer.max_risk` instead.
 """
 _GROUP_HEADS = {
     "": "## The node\n\nWhen it localizes, and of what its priors and answers are poses.",

@@ -37,7 +37,7 @@ from gsfeatloc_ros.replay.run import Replay, ReplayedImage
 from gsfeatloc_ros.replay.truth import Trajectory
 from gsfeatloc_ros.ros_io.outcome import OutcomeStatus
 from gsfeatloc_ros.ros_io.prior import PriorPolicy
-from gsfeatloc_ros.tools.options import Settings, localizer_options, number, setting
+from gsfeatloc_ros.tools.options import CollectSettings, localizer_options, number, setting
 
 # Reasons of a kind in the summary, of which there may be as many as images.
 _MAX_REASONS = 5
@@ -198,7 +198,7 @@ def _parser() -> argparse.ArgumentParser:
         "--set",
         type=setting(lambda parse_number: parse_number),
         default={},
-        action=Settings,
+        action=CollectSettings,
         metavar="OPTION=VALUE",
         help=f"change an option of the localizer: {', '.join(localizer_options())}",
     )

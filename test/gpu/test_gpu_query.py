@@ -70,7 +70,7 @@ def test_finds_the_camera_as_on_the_cpu(gpu, renderer, room_map, room_camera, ro
 
 
 @pytest.mark.parametrize("name", ["sift", "xfeat", "aliked-lightglue", "disk-lightglue"])
-def test_no_picture_leaves_the_gpu_before_the_pose_is_verified(gpu, renderer, room_camera, room_photos, name) -> None:
+def test_no_picture_leaves_the_gpu_before_there_is_an_estimate(gpu, renderer, room_camera, room_photos, name) -> None:
     localizer = Localizer(renderer, MATCHERS[name].create("", 2048, gpu.device))
     photo = room_photos[0]
     image = photo.image.copy()
@@ -78,11 +78,11 @@ def test_no_picture_leaves_the_gpu_before_the_pose_is_verified(gpu, renderer, ro
     gpu.reset()
     estimate = localizer.localize(image, room_camera, photo.T_map_camera_prior)
     assert estimate.status is Status.LOCALIZED
-    # Verification compares pictures, on the host.
+    # The first render at an estimate shows on the host whether the photo is blurred; verification compares pictures too.
     assert max(gpu.to_host) > SMALL, gpu.explain()
     before = list(takewhile(lambda size: size <= SMALL, gpu.to_host))
-    # The photo's corners; of the render at the prior and of those at estimates, matches and the depths under them.
-    assert sum(size > 100 for size in before) == 1 + 2 * (1 + estimate.evidence.passes), gpu.explain()
+    # The photo's corners; of the render at the prior and of the first at an estimate, matches and the depths under them.
+    assert sum(size > 100 for size in before) == 1 + 2 * 2, gpu.explain()
 
 
 def test_a_matcher_on_the_cpu_takes_renders_of_a_gpu(gpu, renderer, room_camera, room_photos) -> None:

@@ -1,7 +1,8 @@
-"""The typed service, as it is built from interfaces/, and how it is built."""
+"""The typed service and message, as they are built from interfaces/, and how they are built."""
 
 from __future__ import annotations
 
+import os
 import shutil
 import subprocess
 from pathlib import Path
@@ -11,9 +12,14 @@ import numpy as np
 import pytest
 import rclpy
 from ament_index_python.packages import get_package_share_directory
+from gsfeatloc_interfaces.msg import ProtectionLevel
 from gsfeatloc_interfaces.srv import LocalizeImage
+from node_harness import connected_client, running_localizer, send_inputs
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.serialization import deserialize_message, serialize_message
+
+from gsfeatloc_ros.client.messages import rgb_image
+from gsfeatloc_ros.localize.protection import RISK
 
 ROOT = Path(__file__).parents[2]
 STATUSES = {"LOCALIZED": 0, "REJECTED": 1, "FAILED": 2, "REFUSED": 3, "ERROR": 4}
@@ -33,6 +39,9 @@ def test_response_has_the_fields():
         "status": "uint8",
         "reason": "string",
         "pose": "geometry_msgs/PoseWithCovarianceStamped",
+        "probability_wrong": "double",
+        "protection_radius": "double",
+        "protection_angle": "double",
         "inliers": "uint32",
         "milliseconds": "double",
     }
@@ -40,6 +49,16 @@ def test_response_has_the_fields():
 
 def test_statuses_are_constants_of_the_response():
     assert {name: getattr(LocalizeImage.Response, name) for name in STATUSES} == STATUSES
+
+
+def test_protection_level_has_the_fields():
+    assert ProtectionLevel.get_fields_and_field_types() == {
+        "header": "std_msgs/Header",
+        "radius": "double",
+        "angle": "double",
+        "risk": "double",
+    }
+    assert ProtectionLevel().risk == RISK
 
 
 def test_empty_request_has_no_prior():
@@ -81,9 +100,10 @@ def test_service_answers_over_dds():
         rclpy.shutdown(context=context)
 
 
-def test_service_file_is_installed_with_its_comments():
-    installed = Path(get_package_share_directory("gsfeatloc_interfaces")) / "srv" / "LocalizeImage.srv"
-    assert installed.read_text() == (ROOT / "interfaces" / "srv" / "LocalizeImage.srv").read_text()
+@pytest.mark.parametrize("file", ["msg/ProtectionLevel.msg", "srv/LocalizeImage.srv"])
+def test_files_are_installed_with_their_comments(file):
+    installed = Path(get_package_share_directory("gsfeatloc_interfaces")) / file
+    assert installed.read_text() == (ROOT / "interfaces" / file).read_text()
 
 
 def test_manifest_agrees_with_that_of_the_node():
@@ -91,6 +111,23 @@ def test_manifest_agrees_with_that_of_the_node():
     for tag in ("version", "license", "maintainer"):
         assert interfaces.findtext(tag) == node.findtext(tag)
     assert interfaces.find("maintainer").get("email") == node.find("maintainer").get("email")
+
+
+def test_the_node_runs_without_them(monkeypatch, room_map_file, room_camera, photo):
+    paths = os.environ["PYTHONPATH"].split(os.pathsep)
+    kept = [path for path in paths if not (Path(path) / "gsfeatloc_interfaces").exists()]
+    assert len(kept) < len(paths)
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(kept))
+    with running_localizer(map__path=room_map_file) as process, connected_client() as client:
+        assert "~/localize_image and the topic protection_level are off: build" in process.output
+        send_inputs(client, room_camera, photo)
+        image = rgb_image(photo.image)
+        answer = client.attempt(image)
+        assert answer.ok, answer
+        assert client.pose_of(image) is not None
+        # It is on /diagnostics all the same.
+        assert float(answer.values["protection_radius"]) > 0
+        assert client.node.count_publishers("protection_level") == 0
 
 
 def built(root: Path, tools: list[str], headers: bool = True, **environment: str) -> subprocess.CompletedProcess:

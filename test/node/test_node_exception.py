@@ -88,9 +88,12 @@ def test_unforeseen_exception_on_the_newest_image_is_a_failure(node, client, pho
     assert client.relocalize().success
 
 
-def test_an_old_name_of_a_parameter_can_be_set_while_it_runs(node, client):
+def test_a_parameter_without_effect_can_be_set_while_it_runs(node, client):
+    before = node.session.engine.options
     assert client.set_parameter("localizer.min_agreement", 0.4).successful
-    assert client.parameter("localizer.min_correlation") == 0.4
-    assert node.session.engine.options.limits.min_correlation == 0.4
-    assert not client.set_parameter("localizer.min_agreement", 2.0).successful
-    assert client.set_parameter("localizer.min_correlation", 0.3).successful
+    assert client.set_parameter("localizer.min_inlier_ratio", "much").successful
+    assert node.session.engine.options == before
+    assert not client.set_parameter("localizer.max_risk", 2.0).successful
+    assert client.set_parameter("localizer.max_risk", 1e-3).successful
+    assert node.session.engine.options.limits.max_risk == 1e-3
+    assert client.set_parameter("localizer.max_risk", 1e-4).successful

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from geometry_msgs.msg import TransformStamped
+from gsfeatloc_interfaces.msg import ProtectionLevel
 from node_harness import assert_close, assert_start_fails, connected_client, running_localizer
 from transforms import transform_stamped
 
@@ -21,6 +22,7 @@ from gsfeatloc_ros.client.messages import (
     stamp_of,
 )
 from gsfeatloc_ros.common.geometry import invert, make_pose, matrix_from_quaternion, so3_exp
+from gsfeatloc_ros.localize.protection import protection_level
 
 # Last: a tf2_ros that is installed comes before it.
 sys.path.append(str(Path(__file__).parents[1] / "support" / "tf2_stand_in"))
@@ -60,6 +62,7 @@ def test_priors_and_answers_of_the_base_and_tf_from_the_map_to_odom(tf, room_map
     with running_localizer(map__path=room_map_file, **ALIGNED) as process, connected_client() as client:
         static = tell_where_the_camera_is(client, T_base_camera)
         moving, heard = tf2_ros.TransformBroadcaster(client.node), client.listen(TFMessage, "/tf")
+        levels = client.listen(ProtectionLevel, "protection_level")
         client.send_camera_info(camera_info_of(room_camera))
         client.send_prior(pose_stamped(T_map_base @ T_base_camera @ off @ invert(T_base_camera)))
         image = rgb_image(photo.image)
@@ -71,7 +74,11 @@ def test_priors_and_answers_of_the_base_and_tf_from_the_map_to_odom(tf, room_map
         pose = client.poses[stamp_of(image)]
         assert pose.header.frame_id == "map"
         assert_close(pose, T_map_base)
-        assert (np.linalg.eigvalsh(np.reshape(pose.pose.covariance, (6, 6))) > 0).all()
+        covariance = np.reshape(pose.pose.covariance, (6, 6))
+        assert (np.linalg.eigvalsh(covariance) > 0).all()
+        # Of the base too: the camera's errors of rotation move it.
+        assert client.spin_until(lambda: any(stamp_of(level) == stamp_of(image) for level in levels))
+        assert levels[-1].radius == pytest.approx(protection_level(covariance).radius)
 
         # It is told again and again, with stamps that go on, so that it can be used between answers.
         def told() -> list[TransformStamped]:

@@ -339,8 +339,10 @@ PARAMETERS_REFUSED = [
     ("localizer.max_views", 3.0),
     ("localizer.min_inliers", 0),
     ("localizer.max_deviation", math.nan),
-    ("localizer.min_correlation", math.nan),
-    ("localizer.min_inlier_ratio", math.nan),
+    ("localizer.max_risk", math.nan),
+    ("localizer.max_risk", 0.0),
+    ("localizer.max_risk", 2.0),
+    ("localizer.min_coverage", math.nan),
     ("localizer.max_image_width", 1),
     ("localizer.seed", -1),
 ]

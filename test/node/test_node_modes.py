@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import re
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from diagnostic_msgs.msg import DiagnosticStatus
 from node_harness import TIMEOUT, assert_close, connected_client
 from rcl_interfaces.srv import DescribeParameters
 from sensor_msgs.msg import Image
@@ -103,6 +107,37 @@ def test_health_says_how_it_goes(client, room_map_file, photo):
     assert float(values["ms_total"]) > 0
     assert float(values["answer_age"]) > 0
     assert "inliers of" in values["last_reason"]
+
+
+def test_health_says_that_camera_info_is_of_another_stream(client, room_camera, photo):
+    client.send_prior(pose_stamped(photo.T_map_camera_prior))
+    K = room_camera.K * [[1.04], [1.04], [1.0]]
+    K[:2, 2] = room_camera.K[:2, 2]
+    client.send_camera_info(camera_info_of(replace(room_camera, K=K)))
+    assert client.set_parameter("localizer.max_views", 0).successful
+    try:
+        for _ in range(10):
+            refused = client.attempt(rgb_image(photo.image))
+            assert refused.values["status"] == "rejected"
+            assert "is camera_info of this stream?" in refused.reason
+        seen = len(client.health)
+        assert client.spin_until(lambda: len(client.health) > seen)
+        health = client.health[-1]
+        assert health.level == DiagnosticStatus.WARN
+        words = r"the focal length fits [34]\.\d \+- 0\.\d % shorter than camera_info says, by \d+ answers"
+        assert re.match(words, health.reason), health
+        assert float(health.values["focal_error"]) == pytest.approx(1 / 1.04 - 1, abs=0.01)
+        assert float(health.values["focal_sigma"]) < 0.006
+        assert int(health.values["focal_answers"]) >= 10
+    finally:
+        assert client.set_parameter("localizer.max_views", 32).successful
+    # With the right one it starts anew.
+    client.send_camera_info(camera_info_of(room_camera))
+    assert client.attempt(rgb_image(photo.image)).ok
+    seen = len(client.health)
+    assert client.spin_until(lambda: len(client.health) > seen)
+    assert int(client.health[-1].values["focal_answers"]) < 10
+    assert "focal length fits" not in client.health[-1].reason
 
 
 def test_debug_image_shows_photo_and_render_and_is_drawn_for_refused_ones_too(client, room_camera, photo):

@@ -11,10 +11,21 @@ from rclpy.exceptions import ParameterException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from gsfeatloc_ros.node.parameters import declare_parameters, read_settings, with_new_names
+from gsfeatloc_ros.node.parameters import declare_parameters, read_settings, without_retired
 from gsfeatloc_ros.node.settings import PARAMETERS, Settings
 
-OLD, NEW = "localizer.min_agreement", "localizer.min_correlation"
+RETIRED = ["localizer.min_inlier_ratio", "localizer.min_correlation", "localizer.min_agreement"]
+
+
+class Log:
+    """The warnings of a node, in place of its logger."""
+
+    def __init__(self, node: Node) -> None:
+        self.warnings: list[str] = []
+        node.get_logger = lambda: self
+
+    def warning(self, text: str) -> None:
+        self.warnings.append(text)
 
 
 @contextmanager
@@ -37,7 +48,7 @@ def test_without_any_given_they_have_their_defaults():
     with node_with() as node:
         assert declare_parameters(node) == Settings()
         assert all(node.has_parameter(parameter.name) for parameter in PARAMETERS)
-        assert not node.has_parameter(OLD)
+        assert not any(map(node.has_parameter, RETIRED))
 
 
 def test_those_given_are_settings():
@@ -52,36 +63,40 @@ def test_those_given_are_settings():
         assert settings.localizer.limits.min_inliers == 30
 
 
-def test_the_value_of_an_old_name_is_used():
-    with node_with(localizer__min_agreement=0.5) as node:
-        assert declare_parameters(node).localizer.limits.min_correlation == 0.5
-        assert node.get_parameter(NEW).value == 0.5
-        assert not node.has_parameter(OLD)
+@pytest.mark.parametrize("name", RETIRED)
+@pytest.mark.parametrize("value", ["0.5", "2.0", "high"])
+def test_what_has_no_effect_any_more_is_accepted_with_a_warning(name, value):
+    with node_with(**{name: value}) as node:
+        log = Log(node)
+        assert declare_parameters(node) == Settings()
+        assert log.warnings == [
+            f"parameter {name} has no effect any more: set localizer.max_risk instead, and remove it"
+        ]
+        assert not node.has_parameter(name)
 
 
-def test_the_default_under_the_new_name_does_not_count():
-    """The launch file's own file of parameters gives it."""
-    with node_with(localizer__min_agreement=0.5, localizer__min_correlation=0.3) as node:
-        assert declare_parameters(node).localizer.limits.min_correlation == 0.5
+@pytest.mark.parametrize("name", RETIRED)
+def test_what_has_no_effect_any_more_can_be_set_later(name):
+    with node_with(localizer__max_risk=0.001) as node:
+        settings = declare_parameters(node)
+        node.add_pre_set_parameters_callback(lambda parameters: without_retired(node, parameters))
+        log = Log(node)
+        assert node.set_parameters([Parameter(name, value=0.5)])[0].successful
+        assert [name in warning for warning in log.warnings] == [True]
+        assert read_settings(node) == settings
+        given = [Parameter("localizer.max_risk", value=0.01), Parameter(name, value=0.5)]
+        assert node.set_parameters_atomically(given).successful
+        assert read_settings(node).localizer.limits.max_risk == 0.01
+        assert not node.has_parameter(name)
 
 
-def test_the_new_name_goes_before_the_old_one():
-    with node_with(localizer__min_agreement=0.5, localizer__min_correlation=0.4) as node:
-        assert declare_parameters(node).localizer.limits.min_correlation == 0.4
-
-
-@pytest.mark.parametrize(("value", "says"), [("2.0", "range"), ("high", "type"), ("1", "type")])
-def test_an_old_name_takes_no_more_than_the_new_one(value, says):
-    with node_with(localizer__min_agreement=value) as node, pytest.raises(ValueError, match=says) as error:
-        declare_parameters(node)
-    assert str(error.value).startswith(f"parameter {OLD}: ")
-
-
-def test_an_old_name_that_is_set_later_is_the_new_one():
-    with node_with() as node:
-        given = [Parameter("mode", value="on_prior"), Parameter(OLD, value=0.5)]
-        named = with_new_names(node, given)
-        assert [(parameter.name, parameter.value) for parameter in named] == [("mode", "on_prior"), (NEW, 0.5)]
+def test_without_names_that_were_retired_nothing_is_said():
+    with node_with(localizer__max_risk=0.001) as node:
+        log = Log(node)
+        assert declare_parameters(node).localizer.limits.max_risk == 0.001
+        given = [Parameter("mode", value="on_prior")]
+        assert without_retired(node, given) == given
+        assert log.warnings == []
 
 
 @pytest.mark.parametrize(("name", "value"), [("mode", "sometimes"), ("matcher__name", "orb")])

@@ -28,6 +28,8 @@ def test_command_writes_its_report(scenes, tmp_path, capsys, method):
         "options",
         "ablation",
         "corruption",
+        "degradation",
+        "negative",
         "queries",
         "success_rate",
         "rotation_error_deg",
@@ -35,9 +37,11 @@ def test_command_writes_its_report(scenes, tmp_path, capsys, method):
         "answered",
         "wrong_answers",
         "milliseconds",
+        "cpu_milliseconds",
         "nees_mean",
         "nees_median",
         "coverage",
+        "protection_exceeded",
         "per_query",
     ]
     assert (report["scene"], report["protocol"], report["method"]) == ("bonsai", "paper", method)
@@ -60,5 +64,6 @@ def test_command_gives_the_same_answer_to_the_same_seed(scenes, tmp_path):
         )
         reports.append(json.loads(path.read_text())["per_query"][0])
         del reports[-1]["milliseconds"]
+        del reports[-1]["cpu_milliseconds"]
         del reports[-1]["stage_milliseconds"]
     assert reports[0] == reports[1]

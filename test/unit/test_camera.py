@@ -148,3 +148,13 @@ def test_field_of_view():
 def test_a_camera_that_cannot_be_is_refused(change, message):
     with pytest.raises(ValueError, match=message):
         Camera(**({"width": 640, "height": 480, "K": K} | change))
+
+
+@pytest.mark.parametrize(("width", "height"), [(160, 120), (120, 160), (1, 200), (3, 2000), (640, 480)])
+def test_enlarging_keeps_both_sides_within_bounds(width: int, height: int) -> None:
+    camera = Camera(width, height, np.array([[100.0, 0, 0.5 * width], [0, 100.0, 0.5 * height], [0, 0, 1]]))
+    larger = camera.enlarged(500.0, 640)
+    assert max(larger.width, larger.height) <= max(640, width, height)
+    assert larger.width >= width
+    assert larger.height >= height
+    assert larger.K[0, 0] <= 500.5

@@ -43,6 +43,8 @@ NEW = {
     "options": {"min_correlation": 0.5},
     "ablation": "",
     "corruption": "dark",
+    "degradation": "",
+    "negative": "",
     "per_query": [
         {
             "photo": "a.png",
@@ -50,6 +52,7 @@ NEW = {
             "rotation_error_deg": 0.1,
             "nees": None,
             "milliseconds": 6.0,
+            "cpu_milliseconds": 7.0,
             "evidence": {"corners": 30, "inliers": 20, "correlation": 0.7, "views": 0},
             "in_ellipsoid": {"90": True, "50": True},
         }
@@ -83,6 +86,7 @@ def test_old_names_new_fields_and_times_make_no_difference(tmp_path, capsys):
         (changed(evidence={"inliers": 21, "correlation": 0.7, "views": 0}), "inliers 20 -> 21"),
         (changed(photo="b.png"), "photo 'b.png', step 0x0.0p+0: only after"),
         (NEW | {"corruption": ""}, "only before"),
+        (NEW | {"degradation": "haze"}, "only before"),
     ],
 )
 def test_what_differs_is_listed(tmp_path, capsys, after, says):

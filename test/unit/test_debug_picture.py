@@ -51,7 +51,7 @@ def localized(correspondences: Matches, width: int = 640, height: int = 480) -> 
 
 def badge(picture: np.ndarray) -> tuple[int, int, int]:
     """Colour behind the status: the one that is most frequent in its corner of the band."""
-    corner = picture[-160:-120, 14:100].reshape(-1, 3)
+    corner = picture[-202:-162, 14:100].reshape(-1, 3)
     colours, counts = np.unique(corner, axis=0, return_counts=True)
     saturated = colours.max(axis=1).astype(int) - colours.min(axis=1) > 60
     return tuple(colours[saturated][counts[saturated].argmax()].tolist())
@@ -165,17 +165,25 @@ def test_the_photo_is_not_drawn_on():
     assert (trace.render.rgb == 0.25).all()
 
 
-def test_every_number_of_the_evidence_is_drawn_in_one_row():
+def test_every_number_of_the_evidence_is_drawn():
     """Fields end before the margin, with all that can be there: evidence, stages and standard deviations."""
     stages = ("prepare", "features", "render", "match", "solve", "track", "verify", "total")
     trace = localized(Matches.none())
-    evidence = Evidence(800, 800, 800, 800, 0.999, 1.0, -0.999, 10.123, 100.123, 20, 1000)
+    numbers = dict.fromkeys(Evidence().numbers(), -0.999)
+    numbers |= {"corners": 800, "matches": 800, "lifted": 800, "inliers": 800, "passes": 20, "views": 1000}
+    evidence = Evidence(**numbers | {"deviation": 100.123, "probability_wrong": 1e-10})
     estimate = replace(trace.estimate, evidence=evidence, milliseconds=dict.fromkeys(stages, 12345.0))
     band = draw(replace(trace, estimate=estimate))[480:]
     assert (band[:, -10:] == band[0, 0]).all()
-    less = draw(replace(trace, estimate=replace(estimate, evidence=replace(evidence, views=0))))[480:]
-    # The last of them can be seen.
-    assert (less != band).any()
+    # In pictures of one size.
+    assert band.shape == draw(nothing())[480:].shape
+    for name in numbers:
+        other = replace(estimate, evidence=replace(evidence, **{name: 3}))
+        assert (draw(replace(trace, estimate=other))[480:] != band).any(), name
+    other = replace(estimate, covariance=100 * estimate.covariance)
+    # The protection level is in the second row.
+    rows = slice(480 + 52, 480 + 52 + 2 * 42)
+    assert (draw(replace(trace, estimate=other))[rows] != draw(replace(trace, estimate=estimate))[rows]).any()
 
 
 def test_a_localized_photo_of_the_room(room_map, room_camera, room_photos):

@@ -21,11 +21,12 @@ from gsfeatloc_ros.common.geometry import (
     so3_log,
     translation_error,
 )
+from gsfeatloc_ros.common.photo import Photo
 from gsfeatloc_ros.common.stage_clock import Interrupted
-from gsfeatloc_ros.evaluate.ablation import ABLATIONS, ablated_localizer
-from gsfeatloc_ros.evaluate.corruptions import CORRUPTIONS
+from gsfeatloc_ros.evaluate.ablation import ABLATIONS, FeatureTracker, WholePixelTracker, ablated_localizer
 from gsfeatloc_ros.evaluate.dataset import PosedPhoto, Scene
 from gsfeatloc_ros.evaluate.metrics import (
+    Cost,
     QueryResult,
     Scoring,
     best_of,
@@ -38,7 +39,7 @@ from gsfeatloc_ros.evaluate.metrics import (
 from gsfeatloc_ros.evaluate.priors_file import read_priors
 from gsfeatloc_ros.evaluate.protocol import (
     PROTOCOLS,
-    Prior,
+    PhotoPrior,
     PriorError,
     make_priors,
     paper_bounds,
@@ -51,6 +52,7 @@ from gsfeatloc_ros.localize.estimate import Estimate, Status
 from gsfeatloc_ros.localize.evidence import Evidence, Limits
 from gsfeatloc_ros.localize.localizer import Localizer
 from gsfeatloc_ros.localize.options import LocalizerOptions
+from gsfeatloc_ros.localize.protection import protection_level
 from gsfeatloc_ros.match import Features, Matches, create_matcher
 from gsfeatloc_ros.render import Render, create_renderer
 
@@ -126,23 +128,27 @@ def offsets(scene, priors):
     return np.degrees([so3_log(offset[:3, :3]) for offset in moved]), np.array([offset[:3, 3] for offset in moved])
 
 
-def test_chen_draws_five_priors_a_photo_in_its_ranges(scene):
-    priors = PROTOCOLS["chen"](scene, 1.0, 0)
-    assert [(prior.photo, prior.step) for prior in priors] == [(i, k) for i in range(3) for k in range(5)]
-    many = replace(scene, photos=scene.photos[:1] * 400)
-    turns, moves = offsets(many, PROTOCOLS["chen"](many, 1.0, 0))
+@pytest.mark.parametrize(
+    ("protocol", "repetitions", "degrees", "radii"),
+    [("chen", 5, (10, 40), (0, 0.2)), ("near-miss", 1, (5, 20), (0.1, 0.5))],
+)
+def test_uniform_protocols_draw_priors_in_their_ranges(scene, protocol, repetitions, degrees, radii):
+    priors = PROTOCOLS[protocol](scene, 1.0, 0)
+    assert [(prior.photo, prior.step) for prior in priors] == [(i, k) for i in range(3) for k in range(repetitions)]
+    many = replace(scene, photos=scene.photos[:1] * (2000 // repetitions))
+    turns, moves = offsets(many, PROTOCOLS[protocol](many, 1.0, 0))
     radius = trajectory_radius(scene)
-    for vectors, low, high in ((turns, 10, 40), (moves, 0, 0.2 * radius)):
+    for vectors, (low, high) in ((turns, degrees), (moves, np.multiply(radii, radius))):
         lengths = np.linalg.norm(vectors, axis=1)
         assert low <= lengths.min() < low + 0.02 * (high - low)
         assert high - 0.02 * (high - low) < lengths.max() <= high
         assert lengths.mean() == pytest.approx((low + high) / 2, rel=0.04)
         np.testing.assert_allclose((vectors / lengths[:, None]).mean(axis=0), 0, atol=0.04)
-    half = offsets(many, PROTOCOLS["chen"](many, 0.5, 0))
+    half = offsets(many, PROTOCOLS[protocol](many, 0.5, 0))
     np.testing.assert_allclose(half, np.array([turns, moves]) / 2, atol=1e-9)
 
 
-@pytest.mark.parametrize("protocol", ["paper", "chen"])
+@pytest.mark.parametrize("protocol", ["paper", "chen", "near-miss"])
 def test_covariance_of_a_prior_is_that_of_the_errors(scene, protocol):
     many = replace(scene, photos=scene.photos[1:2] * 2000)
     priors = PROTOCOLS[protocol](many, 1.0, 0)
@@ -384,7 +390,7 @@ PHOTO = PosedPhoto("a.png", Path("a.png"), CAMERA, np.eye(4))
 def result(estimate, prior=None, prior_is_answer=False, milliseconds=10.0):
     """Measured against a camera at the origin, in a trajectory of radius 2."""
     prior = moved(20.0, 1.0) if prior is None else prior
-    return measure(PHOTO, Prior(0, 3, prior), estimate, milliseconds, Scoring(2.0, prior_is_answer))
+    return measure(PHOTO, PhotoPrior(0, 3, prior), estimate, Cost(milliseconds, 15.0), Scoring(2.0, prior_is_answer))
 
 
 def test_errors_of_an_answer():
@@ -393,7 +399,7 @@ def test_errors_of_an_answer():
     assert (r.prior_rotation_error_deg, r.prior_translation_error) == pytest.approx((20.0, 0.5))
     assert r.answered
     assert r.success
-    assert (r.photo, r.step, r.milliseconds) == ("a.png", 3, 10.0)
+    assert (r.photo, r.step, r.milliseconds, r.cpu_milliseconds) == ("a.png", 3, 10.0, 15.0)
 
 
 @pytest.mark.parametrize(
@@ -435,6 +441,7 @@ def test_what_an_estimate_carries_is_kept_and_ready_for_json():
     assert (r.evidence["inliers"], r.evidence["reprojection_error_px"]) == (20, None)
     assert r.nees is None
     assert r.in_ellipsoid is None
+    assert r.protection_exceeded is None
     assert QueryResult(**json.loads(json.dumps(asdict(r), allow_nan=False))) == r
 
 
@@ -447,6 +454,25 @@ def test_nees_of_a_known_error():
     assert r.in_ellipsoid == {"50": False, "90": False, "95": False}
     assert result(answer(0.5, 0.28, covariance)).in_ellipsoid == {"50": False, "90": False, "95": True}
     assert result(answer(0.5, 0.11, covariance)).in_ellipsoid == {"50": True, "90": True, "95": True}
+
+
+@pytest.mark.parametrize(("degrees", "sigmas", "exceeded"), [(0.0, 0.9, False), (0.0, 1.1, True), (1.1, 0.0, True)])
+def test_an_error_beyond_either_protection_level_is_counted(degrees, sigmas, exceeded):
+    covariance = np.diag([0.1**2] * 3 + [1e-6] * 3)
+    level = protection_level(covariance)
+    estimate = answer(degrees * np.degrees(level.angle), sigmas * level.radius, covariance)
+    assert result(estimate).protection_exceeded is exceeded
+    assert summarize([result(estimate), result(FAILED)])["protection_exceeded"] == int(exceeded)
+
+
+def test_every_answer_to_a_negative_is_wrong():
+    scoring = Scoring(2.0, negative=True)
+    right = measure(PHOTO, PhotoPrior(0, 0, np.eye(4)), FAILED, Cost(1.0, 1.0), scoring)
+    wrong = measure(PHOTO, PhotoPrior(0, 0, np.eye(4)), answer(0.0, 0.0, np.eye(6)), Cost(1.0, 1.0), scoring)
+    assert (right.success, right.verdict) == (True, "none")
+    assert (wrong.success, wrong.verdict) == (False, "wrong")
+    # There is no truth that its covariance could be held against.
+    assert wrong.nees is wrong.in_ellipsoid is wrong.protection_exceeded is None
 
 
 def test_chi_square_distribution_is_that_of_the_tables():
@@ -484,6 +510,7 @@ def test_summary():
     assert summary["wrong_answers"] == 1
     assert summary["rotation_error_deg"] == pytest.approx({"mean": (1 + 2 + 90 + 20) / 4, "median": 11.0})
     assert summary["translation_error"] == pytest.approx({"mean": (0.01 + 0.02 + 0.03 + 0.5) / 4, "median": 0.025})
+    assert summary["cpu_milliseconds"] == {"median": 15.0}
     assert summary["milliseconds"] == pytest.approx({"median": 25.0, "p95": 38.5})
     assert json.loads(json.dumps(summary, allow_nan=False)) == summary
 
@@ -531,7 +558,7 @@ def test_success_by_step():
 def test_every_ablation_makes_a_difference(ablation, room_map, room_camera, room_photos):
     photo, matcher = room_photos[0], create_matcher("sift")
     renderer = create_renderer(room_map)
-    options = LocalizerOptions(limits=Limits(min_inlier_ratio=0.3), max_passes=1)
+    options = LocalizerOptions(limits=Limits(max_risk=1.0), max_passes=1)
 
     def answer(taken_out):
         localizer = ablated_localizer(renderer, matcher, options, taken_out)
@@ -546,25 +573,19 @@ def test_every_ablation_makes_a_difference(ablation, room_map, room_camera, room
     np.testing.assert_array_equal(answer("").T_map_camera, whole.T_map_camera)
 
 
+@pytest.mark.parametrize("ablation", ["tracking", "sub-pixel"])
+def test_trackers_of_ablations_find_the_renders_corners_in_the_photo(ablation, room_photos):
+    image, matcher = room_photos[0].image, create_matcher("sift")
+    shifted = np.roll(image, 3, axis=1)
+    photo = Photo(image, np.ones(image.shape[:2], bool), Camera(image.shape[1], image.shape[0], CAMERA.K))
+    tracker = FeatureTracker(matcher, photo, "cpu") if ablation == "tracking" else WholePixelTracker(photo, "cpu")
+    for matches in (tracker.track(shifted), tracker.track_back(shifted)):
+        assert len(matches) > 100
+        np.testing.assert_allclose(np.median(matches.b - matches.a, axis=0), [3, 0], atol=0.6)
+        if ablation == "sub-pixel":
+            np.testing.assert_array_equal(matches.b, np.round(matches.b))
+
+
 def test_an_ablation_that_is_not_known():
     with pytest.raises(ValueError, match="ablation 'renderer' is not one of tracking, sub-pixel"):
         ablated_localizer(GivenDepth(np.ones((240, 320))), GivenMatches([], []), LocalizerOptions(), "renderer")
-
-
-# Corruptions
-
-
-@pytest.mark.parametrize("name", CORRUPTIONS)
-def test_corrupted_photos_are_of_the_same_size_and_worse(name, room_photos):
-    image = room_photos[0].image
-    kept = image.copy()
-    corrupted = CORRUPTIONS[name](image)
-    np.testing.assert_array_equal(image, kept)
-    assert corrupted.shape == image.shape
-    assert corrupted.dtype == np.uint8
-    changed = (corrupted != image).any(axis=2).mean()
-    if name.startswith("cover"):
-        assert changed == pytest.approx(int(name[-2:]) / 100, abs=0.02)
-    else:
-        assert changed > 0.5
-    np.testing.assert_array_equal(CORRUPTIONS[name](image), corrupted)

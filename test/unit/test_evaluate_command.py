@@ -1,7 +1,10 @@
 """The command: what it writes and prints, several processes, and going on where it was interrupted."""
 
 import ast
+import itertools
 import json
+import re
+import shutil
 from dataclasses import asdict
 from pathlib import Path
 
@@ -13,9 +16,15 @@ from room_datasets import write_nerfstudio
 import gsfeatloc_ros
 from gsfeatloc_ros.common.geometry import quaternion_from_matrix
 from gsfeatloc_ros.common.parameter import parameters_of
-from gsfeatloc_ros.evaluate.record import _NOT_MEASURED, fingerprint_of, hash_scene
+from gsfeatloc_ros.evaluate.corruptions import CORRUPTIONS
+from gsfeatloc_ros.evaluate.degradations import DEGRADATIONS
+from gsfeatloc_ros.evaluate.negatives import NEGATIVES
+from gsfeatloc_ros.evaluate.plan import Combinations, Evaluation
+from gsfeatloc_ros.evaluate.record import _NOT_MEASURED, Record, fingerprint_of, hash_scene
 from gsfeatloc_ros.evaluate.run import Run, draw_priors
 from gsfeatloc_ros.evaluate.scene import load_scene
+from gsfeatloc_ros.evaluate.suites import SUITES
+from gsfeatloc_ros.evaluate.tables import Group
 from gsfeatloc_ros.localize.options import LocalizerOptions
 from gsfeatloc_ros.maps import load_map
 from gsfeatloc_ros.maps.ply import write_ply
@@ -143,12 +152,104 @@ def test_parts_are_taken_out_and_photos_corrupted_one_at_a_time(room_scene, tmp_
 
 
 @pytest.mark.slow
-def test_the_old_name_of_a_localizer_option_works_with_a_notice(room_scene, tmp_path, capsys):
-    path = tmp_path / "report.json"
-    assert main([str(room_scene), *QUICK, "--set", "min_agreement=1.0", "--limit", "1", "--json", str(path)]) == 0
-    assert read(path)["options"] == {"min_correlation": 1.0}
-    assert read(path)["answered"] == 0
-    assert "option min_agreement is now min_correlation" in capsys.readouterr().err
+def test_maps_are_degraded_one_way_at_a_time(room_scene, tmp_path, capsys):
+    path = tmp_path / "degraded.json"
+    assert main([str(room_scene), *QUICK, "--degrade", "nothing,haze,grown", "--limit", "1", "--json", str(path)]) == 0
+    runs = read(path)["runs"]
+    assert [run["degradation"] for run in runs] == ["", "haze", "grown"]
+    assert len({run["per_query"][0]["rotation_error_deg"] for run in runs}) == 3
+    assert "default sift haze map" in capsys.readouterr().out
+
+
+@pytest.fixture(scope="module")
+def trust(tmp_path_factory, room_camera, photos, room_map_file):
+    """The folder of what `--suite trust` wrote of one photo, and the arguments."""
+    folder = tmp_path_factory.mktemp("trust")
+    (folder / "room").mkdir()
+    scene = write_nerfstudio(folder / "room", room_camera.scaled(320, 240), photos[:1], room_map_file)
+    arguments = [str(scene), *QUICK, "--suite", "trust", "--set", "max_views=0"]
+    assert main([*arguments, "--json", str(folder / "trust.json"), "--report", str(folder)]) == 0
+    return folder, arguments
+
+
+@pytest.mark.slow
+def test_the_suite_runs_everything(trust):
+    folder, _ = trust
+    report = read(folder / "trust.json")
+    runs = report["runs"]
+    assert [run["corruption"] for run in runs if run["corruption"]] == list(CORRUPTIONS)
+    assert [run["degradation"] for run in runs if run["degradation"]] == list(DEGRADATIONS)
+    assert [run["negative"] for run in runs if run["negative"]] == list(NEGATIVES)
+    assert [run["protocol"] for run in runs].count("near-miss") == 1
+    assert all(run["queries"] == 1 for run in runs)
+    total = report["trust"][-1]
+    assert (total["kind"], total["name"], total["queries"], total["wrong"]) == ("all", "", len(runs), 0)
+    rows = {row["name"]: row for row in report["trust"]}
+    assert rows["dark"]["kind"] == "corrupted photos"
+    assert rows["haze"]["kind"] == "degraded maps"
+    assert rows["black"] == rows["black"] | {"queries": 1, "right": 1, "wrong": 0, "nees": None, "answers": 0}
+    assert rows["priors of paper"] == rows["priors of paper"] | {"right": 1, "answers": 1}
+    assert rows["priors of paper"]["cpu_milliseconds"] > 0
+    page = (folder / "index.html").read_text()
+    assert page.count("Whether answers can be trusted") == 1
+    assert "photos that are not of the scene" in page
+    # All but the figures of the right photos would be a jumble.
+    assert page.count("<svg") == 2 * 3
+
+
+@pytest.mark.slow
+def test_the_suite_goes_on_where_it_was(trust, capsys):
+    folder, arguments = trust
+    record = folder / "results.jsonl"
+    record.write_text("".join(record.read_text().splitlines(keepends=True)[:-4]))
+    queries = read(folder / "trust.json")["trust"][-1]["queries"]
+    assert main([*arguments, "--json", str(folder / "trust.json"), "--report", str(folder)]) == 0
+    printed = capsys.readouterr().out
+    assert f"has {queries - 2} of the {queries} results already" in printed
+    lines = [re.split("  +", line.strip())[0] for line in printed.splitlines()]
+    kinds = ["right photos", "corrupted photos", "wrong calibrations", "degraded maps"]
+    kinds += ["photos that are not of the scene", "all"]
+    assert [line for line in lines if line in kinds] == kinds
+    assert {"near-miss", "focal+5", "bent-0.5", "mirror-pose"} <= {line.removeprefix("priors of ") for line in lines}
+
+
+def test_in_the_suite_the_photos_of_each_scene_are_looked_for_in_all_others():
+    scenes = [(Path(f"/scenes/{name}"), None) for name in ("bonsai", "lego", "office")]
+    conditions = SUITES["trust"]
+    runs = Combinations(scenes, conditions, None, ["default"], ["sift"], [1.0], [0, 1], 640, {}).runs()
+    assert len(runs) == len(set(runs)) == 2 * (3 * (len(conditions) - 1) + 6)
+    others = {(run.scene.name, Path(run.negative).name) for run in runs if run.negative not in ("", *NEGATIVES)}
+    assert others == {(a.name, b.name) for a, _ in scenes for b, _ in scenes if a != b}
+    # A map is not degraded, or read, more often than needed.
+    maps = [(run.scene, run.degradation) for run in runs]
+    assert len(set(maps)) == sum(a != b for a, b in itertools.pairwise(maps)) + 1
+
+
+@pytest.mark.slow
+def test_an_answer_to_a_photo_of_another_scene_is_wrong(room_scene, tmp_path):
+    # The hall is the room, so that there is an answer; no map is needed for its photos.
+    hall = tmp_path / "hall"
+    shutil.copytree(room_scene, hall)
+    (hall / "map.ply").unlink()
+    run = Run(room_scene, None, "paper", None, "default", "sift", 0.1, 0, 640, negative=str(hall))
+
+    def evaluation():
+        return Evaluation([run], 1, Record(tmp_path / "results.jsonl"))
+
+    first = evaluation()
+    assert len(list(first.localize(1))) == 1
+    (results,) = first.results()
+    (result,) = results.results
+    assert (result.photo, result.verdict, result.success, result.nees) == ("0.png", "wrong", False, None)
+    assert (Group([results]).label, Group([results]).describe()["negative"]) == (
+        "default sift not of the scene: of hall",
+        "hall",
+    )
+    assert evaluation().to_do == []
+    # Its photos are part of what the result depends on.
+    transforms = read(hall / "transforms.json")
+    (hall / "transforms.json").write_text(json.dumps(transforms | {"cx": 160.0}))
+    assert len(evaluation().to_do) == 1
 
 
 @pytest.mark.slow
@@ -287,6 +388,14 @@ def test_nothing_that_is_measured_imports_what_no_result_depends_on():
         (["--set", "max_passes=1.5"], "'1.5' is not a number"),
         (["--set", "seed=1"], "seed=1 is not OPTION=VALUE"),
         (["--set", "cauchy_scale=1"], "cauchy_scale=1 is not OPTION=VALUE"),
+        (["--set", "min_inlier_ratio=0.3"], "min_inlier_ratio is no option any more: use max_risk, the largest"),
+        (["--set", "min_correlation=0.3"], "min_correlation is no option any more: use max_risk, the largest"),
+        (["--set", "min_agreement=0.3"], "min_agreement is no option any more: use max_risk, the largest"),
+        (["--degrade", "fog"], "fog is not one of nothing, dropped"),
+        (["--suite", "all"], "invalid choice: 'all'"),
+        (["--suite", "trust", "--corruption", "dark"], "--suite trust has its own --corruption"),
+        (["--suite", "trust", "--degrade", "haze"], "--suite trust has its own --degrade"),
+        (["--suite", "trust", "--protocol", "chen"], "--suite trust has its own --protocol"),
         (["--ablation", "renderer"], "renderer is not one of nothing, tracking"),
         (["--without", "renderer"], "renderer is not one of nothing, tracking"),
         (["--jobs", "0"], "'0' is not a number of at least 1"),

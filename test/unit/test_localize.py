@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from asserts import assert_no_answer
@@ -54,6 +55,11 @@ def test_the_answer_carries_its_evidence(sift_localizer, room_camera, room_photo
     assert 0.5 < evidence.correlation <= 1.0
     assert 0.5 < evidence.coverage <= 1.0
     assert 0 < evidence.deviation < 8
+    assert evidence.probability_wrong < 1e-4
+    assert abs(evidence.focal_error) < 0.01
+    assert evidence.blur_px == 0
+    assert evidence.changed < 0.1
+    assert estimate.protection.radius > 0.01
     assert {
         "prepare",
         "features",
@@ -147,9 +153,8 @@ def test_the_estimate_is_verified_by_the_render_there(renderer, room_camera, roo
     photo = room_photos[0]
     demands = {
         "min_inliers": (100_000, "at least 100000 needed"),
-        "min_inlier_ratio": (1.0, "inliers"),
+        "max_risk": (1e-30, "wrong with a probability of"),
         "min_coverage": (1.1, "of the photo"),
-        "min_correlation": (1.1, "correlation"),
     }
     for option, (value, says) in demands.items():
         demanding = Localizer(
@@ -197,3 +202,46 @@ def test_a_perfect_prior_is_confirmed(sift_localizer, room_camera, room_photos) 
     )
     assert estimate.localized
     assert translation_error(estimate.T_map_camera, photo.T_map_camera) < 0.02
+
+
+def motion(image: np.ndarray, pixels: int) -> np.ndarray:
+    """The photo of a camera that moved sideways."""
+    return cv2.blur(image, (pixels, 1))
+
+
+@pytest.mark.parametrize("pixels", [15, 25])
+def test_a_blurred_photo_is_compared_with_a_render_blurred_alike(
+    sift_localizer, room_camera, room_photos, pixels: int
+) -> None:
+    photo = room_photos[0]
+    estimate = sift_localizer.localize(motion(photo.image, pixels), room_camera, photo.T_map_camera_prior)
+    assert estimate.localized, estimate.reason
+    assert estimate.evidence.blur_px == pytest.approx(pixels, rel=0.35)
+    assert rotation_error_deg(estimate.T_map_camera, photo.T_map_camera) < 1.0
+    assert translation_error(estimate.T_map_camera, photo.T_map_camera) < 0.05
+
+
+@pytest.mark.parametrize("error", [-0.05, 0.05])
+def test_a_wrong_focal_length_is_refused_and_told(sift_localizer, room_camera, room_photos, error: float) -> None:
+    told = 0
+    for photo in room_photos[:3]:
+        camera = replace(room_camera, K=room_camera.K @ np.diag([1 + error, 1 + error, 1]))
+        estimate = sift_localizer.localize(photo.image, camera, photo.T_map_camera_prior)
+        assert_no_answer(estimate)
+        # It is the camera's own that fits: shorter by what was given too long.
+        told += abs(estimate.evidence.focal_error + error / (1 + error)) < 0.02
+        assert "focal length" in estimate.reason or "wrong with a probability" in estimate.reason
+    assert told >= 2
+
+
+def test_what_covers_the_photo_does_not_count(sift_localizer, room_camera, room_photos) -> None:
+    """Something in front of the camera, textured like the room itself: another part of the photo, turned."""
+    photo = room_photos[0]
+    image = photo.image.copy()
+    image[100:380, 150:490] = photo.image[60:340, 300:640][::-1, ::-1]
+    trace = sift_localizer.trace(image, room_camera, photo.T_map_camera_prior)
+    assert trace.estimate.localized, trace.estimate.reason
+    assert rotation_error_deg(trace.estimate.T_map_camera, photo.T_map_camera) < 1.0
+    changed = trace.changed()
+    assert changed[140:340, 190:450].mean() > 2 * changed[:80].mean()
+    assert 0.1 < trace.estimate.evidence.changed < 0.6

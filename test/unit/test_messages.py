@@ -153,6 +153,13 @@ def test_image_message_comes_back_as_it_was(rgb):
     assert np.array_equal(decode_image(message), rgb)
 
 
+@given(npst.arrays(np.uint8, st.tuples(st.integers(1, 9), st.integers(1, 9))))
+def test_image_message_of_grey_pixels_comes_back_as_it_was(grey):
+    message = image_message(grey, Header(frame_id="camera"))
+    assert (message.encoding, message.step) == ("mono8", grey.shape[1])
+    assert np.array_equal(decode_image(message), np.repeat(grey[..., None], 3, axis=2))
+
+
 def test_image_message_takes_a_view():
     rgb = np.arange(4 * 6 * 3, dtype=np.uint8).reshape(4, 6, 3)
     assert np.array_equal(decode_image(image_message(rgb[::2, ::3], Header())), rgb[::2, ::3])

@@ -3,13 +3,21 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from room_datasets import write_nerfstudio
 
-from gsfeatloc_ros.evaluate.negatives import NegativeOptions, NegativeResult, draw_negatives, negative_table
+from gsfeatloc_ros.common.geometry import make_pose
+from gsfeatloc_ros.evaluate.negatives import (
+    NEGATIVES,
+    NegativeOptions,
+    NegativeResult,
+    draw_negatives,
+    negative_table,
+)
 from gsfeatloc_ros.evaluate.protocol import PROTOCOLS
 from gsfeatloc_ros.evaluate.scene import load_scene
 from gsfeatloc_ros.localize.estimate import Estimate, Status
@@ -27,20 +35,41 @@ def scene_folder(tmp_path_factory, room, room_camera, room_map_file) -> Path:
 
 def test_negatives_are_of_every_kind_with_the_priors_of_the_paper(scene_folder):
     scene = load_scene(scene_folder)
-    drawn = list(draw_negatives(scene, [scene], NegativeOptions(sigma=0.5, seed=3, limit=2)))
-    kinds = [negative.kind for negative in drawn]
-    assert kinds == ["mirrored"] * 2 + ["upside-down"] * 2 + [scene.name] * 2 + ["noise"] * 2 + ["black"] * 2
+    options = NegativeOptions(sigma=0.5, seed=3, limit=2)
+    drawn = {kind: draw_negatives(scene, kind, options) for kind in NEGATIVES}
+    drawn[scene.name] = draw_negatives(scene, scene, options)
+    for kind, negatives_ in drawn.items():
+        assert [negative.kind for negative in negatives_] == [kind] * 2
+        for index, negative in enumerate(negatives_):
+            assert negative.prior.photo == index
+            assert negative.camera is scene.photos[index].camera
+            assert negative.read().shape == (negative.camera.height, negative.camera.width, 3)
+            np.testing.assert_array_equal(negative.read(), negative.read())
     image, priors = scene.read_photo(scene.photos[0]), PROTOCOLS["paper"](scene, 0.5, 3)
-    np.testing.assert_array_equal(drawn[0].image, image[:, ::-1])
-    np.testing.assert_array_equal(drawn[2].image, image[::-1])
-    assert drawn[6].image.std() > 70
-    assert not drawn[8].image.any()
+    np.testing.assert_array_equal(drawn["mirrored"][0].read(), image[:, ::-1])
+    np.testing.assert_array_equal(drawn["upside-down"][0].read(), image[::-1])
+    np.testing.assert_array_equal(drawn["mirror-pose"][0].read(), image[:, ::-1])
+    np.testing.assert_array_equal(drawn[scene.name][0].read(), image)
+    assert drawn["noise"][0].read().std() > 70
+    assert (drawn["noise"][0].read() != drawn["noise"][1].read()).any()
+    assert not drawn["black"][0].read().any()
     # Every second of the own photos is looked for where it was taken.
-    np.testing.assert_array_equal(drawn[0].prior.T_map_camera, scene.photos[0].T_map_camera)
-    for negative in (drawn[1], drawn[3], drawn[5], drawn[7], drawn[9]):
-        np.testing.assert_array_equal(negative.prior.T_map_camera, priors[1].T_map_camera)
-        np.testing.assert_array_equal(negative.prior.covariance, priors[1].covariance)
-        assert negative.camera is scene.photos[1].camera
+    for kind in ("mirrored", "upside-down"):
+        np.testing.assert_array_equal(drawn[kind][0].prior.T_map_camera, scene.photos[0].T_map_camera)
+    for kind in ("mirrored", "upside-down", "noise", "black", scene.name):
+        np.testing.assert_array_equal(drawn[kind][1].prior.T_map_camera, priors[1].T_map_camera)
+        np.testing.assert_array_equal(drawn[kind][1].prior.covariance, priors[1].covariance)
+
+
+def test_a_mirror_pose_is_on_the_opposite_side_and_looks_back(scene_folder):
+    scene = load_scene(scene_folder)
+    # Two upright cameras that look at each other, along z; y points down.
+    here, there = make_pose(np.eye(3), np.array([1.0, 0.5, -2.0])), make_pose(np.diag([-1.0, 1, -1]), np.zeros(3))
+    there[:3, 3] = [1.0, 0.5, 4.0]
+    scene = replace(scene, photos=(replace(scene.photos[0], T_map_camera=here),), trajectory=np.array([here, there]))
+    (negative,) = draw_negatives(scene, "mirror-pose", NegativeOptions())
+    np.testing.assert_allclose(negative.prior.T_map_camera, there, atol=1e-12)
+    np.testing.assert_array_equal(negative.prior.covariance, PROTOCOLS["paper"](scene, 1.0, 0)[0].covariance)
 
 
 def result(status: Status, kind: str = "noise", seconds: float = 1.0) -> NegativeResult:
@@ -71,11 +100,12 @@ def test_tool_gives_no_negative_a_pose(scene_folder, tmp_path, capsys):
     assert [(row["kind"], row["photo"]) for row in rows] == [
         ("mirrored", "0.png"),
         ("upside-down", "0.png"),
+        ("mirror-pose", "0.png"),
         ("noise", "noise 0"),
         ("black", "black 0"),
     ]
     assert {row["status"] for row in rows} <= {"failed", "rejected"}
-    assert capsys.readouterr().out.splitlines()[-1] == "accepted 0 of 4"
+    assert capsys.readouterr().out.splitlines()[-1] == "accepted 0 of 5"
 
 
 def test_the_old_name_of_the_tool_works_with_a_notice(tmp_path, capsys):

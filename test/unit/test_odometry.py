@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gsfeatloc_ros.common.geometry import invert, make_pose, so3_exp
-from gsfeatloc_ros.ros_io.odometry import Odometry
+from gsfeatloc_ros.ros_io.odometry import OdometryBuffer
 
 SECOND = 1_000_000_000
 
@@ -21,8 +21,8 @@ def on_a_circle(seconds: float) -> np.ndarray:
     return make_pose(so3_exp(np.array([0, 0, angle])), [2 * np.sin(angle), 2 * (1 - np.cos(angle)), 0.0])
 
 
-def filled(start: float, end: float, period: float = 0.05) -> Odometry:
-    odometry = Odometry(60.0)
+def filled(start: float, end: float, period: float = 0.05) -> OdometryBuffer:
+    odometry = OdometryBuffer(60.0)
     for step in range(round((end - start) / period) + 1):
         seconds = start + step * period
         odometry.add(round(seconds * SECOND), on_a_circle(seconds))
@@ -30,7 +30,7 @@ def filled(start: float, end: float, period: float = 0.05) -> Odometry:
 
 
 def test_nothing_is_known_without_odometry():
-    assert Odometry(60.0).motion(0, SECOND) is None
+    assert OdometryBuffer(60.0).motion(0, SECOND) is None
 
 
 @given(start=st.floats(100.0, 110.0), end=st.floats(100.0, 110.0))
@@ -85,7 +85,7 @@ def test_what_is_later_is_forgotten():
 
 
 def test_the_last_minute_is_kept_and_not_much_more():
-    odometry = Odometry(1.0)
+    odometry = OdometryBuffer(1.0)
     for step in range(20000):
         odometry.add(step * SECOND // 100, np.eye(4))
     assert odometry.motion(199 * SECOND, 199 * SECOND + SECOND // 2) is not None

@@ -69,9 +69,18 @@ def test_uncertainty_lies_along_the_ray() -> None:
 
 def test_a_floater_does_not_void_the_uncertainty() -> None:
     render = plane_render()
-    render.depth_std[:] = 50.0
+    render.depth_std[:] = 1.0
     lifted = lift(render, small_camera(), np.eye(4), np.array([[10.0, 10.0]]), LiftOptions())
     assert lifted.sigmas[0, 2] == pytest.approx(DEPTH_SIGMA_PER_STD * MAX_DEPTH_STD * 2.3)
+
+
+def test_a_depth_that_may_be_that_of_a_haze_is_none() -> None:
+    """Of two layers, the spread is at most half of the farther one's depth; of a haze in front, it is far more."""
+    render = plane_render()
+    pixel = np.array([[10.0, 10.0]])
+    for spread, valid in ((0.49 * 2.3, True), (0.51 * 2.3, False)):
+        render.depth_std[:] = spread
+        assert lift(render, small_camera(), np.eye(4), pixel, LiftOptions()).valid[0] == valid
 
 
 @pytest.mark.parametrize("pixel", [(-0.1, 5), (39.1, 5), (5, -0.1), (5, 29.1), (np.nan, 5)])
@@ -153,6 +162,33 @@ def test_noise_alone_finds_few_inliers() -> None:
     assert solution is None or solution.inliers.sum() < 10
 
 
+def test_a_pose_that_is_not_plausible_gives_way_to_one_that_is() -> None:
+    """As when most of the photo shows something that is seen elsewhere in the map."""
+    most, _ = scene(0, count=200)
+    elsewhere = make_pose(so3_exp(np.array([0.0, 0.0, 2.0])), np.array([5.0, 0.0, 0.0]))
+    fewer, _ = scene(1, count=100)
+    found = Correspondences(
+        np.concatenate([most.pixels, fewer.pixels]),
+        np.concatenate([transform(elsewhere, most.points), fewer.points]),
+        np.zeros((300, 3)),
+    )
+    assert translation_error(solve_pose(CAMERA, found, PoseOptions(), 0).T_map_camera, elsewhere @ POSE) < 0.05
+    near = solve_pose(CAMERA, found, PoseOptions(), 0, lambda pose: translation_error(pose, POSE) < 1)
+    assert translation_error(near.T_map_camera, POSE) < 0.05
+    assert near.inliers.shape == (300,)
+    assert near.inliers[200:].mean() > 0.95 > 0.1 > near.inliers[:200].mean()
+    # Where no pose is plausible, the first is told: the verdict says what is wrong with it.
+    far = solve_pose(CAMERA, found, PoseOptions(), 0, lambda pose: False)
+    assert translation_error(far.T_map_camera, elsewhere @ POSE) < 0.05
+
+
+def test_neighbours_that_are_off_alike_widen_the_covariance() -> None:
+    found, _ = scene(0, count=600, noise=0.3)
+    usual = refine_pose(CAMERA, POSE, found, PoseOptions())[1]
+    bent = replace(found, pixels=found.pixels + 1.5 * np.sin(found.pixels[:, ::-1] / 40.0))
+    assert np.trace(refine_pose(CAMERA, POSE, bent, PoseOptions())[1]) > 4 * np.trace(usual)
+
+
 def test_jacobians_equal_finite_differences() -> None:
     found, _ = scene(1, count=20)
     camera = Camera(640, 480, np.array([[600.0, 3.0, 315], [0, 610.0, 245], [0, 0, 1]]))
@@ -187,7 +223,7 @@ def test_covariance_of_independent_errors_is_that_of_many_trials(depth_noise: fl
         sigmas = depth_noise * rays / np.linalg.norm(rays, axis=1, keepdims=True)
         moved = points + sigmas * rng.normal(size=(len(points), 1))
         lifted = Correspondences(found.pixels, moved, sigmas)
-        pose, covariance = refine_pose(CAMERA, POSE, lifted, PoseOptions(shared_error=0.0))
+        pose, covariance = refine_pose(CAMERA, POSE, lifted, PoseOptions(shared_error=0.0, shared_share=0.0))
         error = np.concatenate([pose[:3, 3] - POSE[:3, 3], so3_log(pose[:3, :3] @ POSE[:3, :3].T)])
         nees.append(error @ np.linalg.solve(covariance, error) / 6)
     assert 0.5 < np.mean(nees) < 1.2

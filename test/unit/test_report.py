@@ -22,6 +22,7 @@ from gsfeatloc_ros.evaluate.report.paper import TABLES, published_table
 from gsfeatloc_ros.evaluate.run import Run, Task, draw_priors, localize
 from gsfeatloc_ros.evaluate.scene import load_scene
 from gsfeatloc_ros.evaluate.tables import Group, RunResults, over_seeds
+from gsfeatloc_ros.evaluate.trust import trust_rows, trust_table
 from gsfeatloc_ros.match import Matches
 from gsfeatloc_ros.simulate import simulate_photos
 from gsfeatloc_ros.tools.evaluate import main
@@ -126,10 +127,11 @@ def test_worst_queries_are_shown_with_the_reason(page):
     assert len(pictures) == 6
     for picture in pictures:
         image = cv2.imdecode(np.frombuffer(base64.b64decode(picture), np.uint8), cv2.IMREAD_COLOR)
-        assert image.shape == (240, 3 * 320 + 12, 3)
+        # The photos are 320 pixels wide; they are localized enlarged, and shown as wide as pictures may be.
+        assert image.shape == (315, 3 * 420 + 12, 3)
     # Of the black photo: on the left.
-    assert image[:, :310].max() < 20
-    assert image[:, 340:640].mean() > 40
+    assert image[:, :410].max() < 20
+    assert image[:, 440:840].mean() > 40
 
 
 @pytest.mark.slow
@@ -181,9 +183,11 @@ def made(**changes):
         reason="found",
         evidence={"matches": 100, "inliers": 80, "passes": 3},
         milliseconds=200.0,
+        cpu_milliseconds=300.0,
         stage_milliseconds={"render": 50.0, "match": 100.0, "total": 190.0},
         nees=1.0,
         in_ellipsoid={"50": False, "90": True, "95": True},
+        protection_exceeded=False,
     )
     return replace(result, **changes)
 
@@ -195,6 +199,48 @@ def test_runs_are_put_together_over_their_seeds():
     assert (first.seeds, len(first.results), second.seeds) == ("0-3", 4, "0")
     assert Group(runs[:2]).seeds == "0,1"
     assert over_seeds([]) == []
+
+
+def test_trust_is_counted_by_what_photos_and_maps_were_put_through():
+    nothing = made(answered=False, success=False, nees=None, in_ellipsoid=None, protection_exceeded=None)
+    far = made(nees=5.0, in_ellipsoid={"50": False, "90": False, "95": False}, protection_exceeded=True)
+    wrong = replace(far, success=False)
+    refused, believed = replace(nothing, success=True), replace(nothing, answered=True)
+    hall = replace(RUN, scene=Path("/scenes/hall"))
+    runs = [
+        (RUN, [made(), nothing, far]),
+        (hall, [made(cpu_milliseconds=100.0)]),
+        (replace(RUN, protocol="near-miss"), [made()]),
+        (replace(RUN, negative="/scenes/hall"), [refused, believed]),
+        (replace(RUN, degradation="haze"), [wrong]),
+        (replace(RUN, corruption="focal+5"), [made()]),
+        (replace(RUN, corruption="dark"), [made()]),
+    ]
+    groups = over_seeds([RunResults(run, [None] * len(results), results) for run, results in runs])
+    rows = trust_rows(groups)
+    assert [(row.kind, row.name) for row in rows] == [
+        ("right photos", ""),
+        ("right photos", "priors of paper"),
+        ("right photos", "priors of near-miss"),
+        ("corrupted photos", ""),
+        ("corrupted photos", "dark"),
+        ("wrong calibrations", ""),
+        ("wrong calibrations", "focal+5"),
+        ("degraded maps", ""),
+        ("degraded maps", "haze"),
+        ("photos that are not of the scene", ""),
+        ("photos that are not of the scene", "of hall"),
+        ("all", ""),
+    ]
+    # Both scenes; NEES and what follows are of the answers.
+    assert rows[1].cells() == ("4", "75.0 %", "0", "2.33", "67 %", "1 of 3", "300")
+    assert rows[8].cells() == ("1", "0.0 %", "1", "5.00", "0 %", "1 of 1", "300")
+    assert rows[10].cells() == ("2", "50.0 %", "1", "-", "-", "-", "300")
+    assert (rows[-1].queries, rows[-1].right, rows[-1].wrong, rows[-1].beyond_level) == (10, 7, 2, 2)
+    table = trust_table(groups).splitlines()
+    assert len(table) == 1 + len(rows)
+    assert table[1].startswith("right photos")
+    assert table[2].startswith("  priors of paper")
 
 
 @pytest.mark.parametrize("table", TABLES, ids=lambda table: table.dataset)

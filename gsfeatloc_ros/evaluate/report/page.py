@@ -17,7 +17,11 @@ from gsfeatloc_ros.evaluate.report import figures
 from gsfeatloc_ros.evaluate.report.paper import SOURCE, PublishedTable, published_table
 from gsfeatloc_ros.evaluate.report.worst import WorstQuery, worst_queries
 from gsfeatloc_ros.evaluate.run import PRIORS_FILE, Run
-from gsfeatloc_ros.evaluate.tables import Group, RunResults, over_seeds
+from gsfeatloc_ros.evaluate.tables import Group, RunResults, condition_words, over_seeds
+from gsfeatloc_ros.evaluate.trust import TrustRow, trust_rows
+
+# More do not fit into a figure.
+_MAX_DRAWN = 7
 
 
 @dataclass(frozen=True)
@@ -26,11 +30,13 @@ class Case:
 
     Attributes:
         groups: of several methods, matchers and options.
+        trust: rows of the table of all that photos and map were put through; none where that was nothing.
         published: what was published of the scene's data set under this protocol, None if nothing.
         figures: captions and SVG.
     """
 
     groups: list[Group]
+    trust: list[TrustRow]
     published: PublishedTable | None
     figures: list[tuple[str, str]]
 
@@ -65,9 +71,11 @@ def write_report(folder: Path, runs: Sequence[RunResults], command: str) -> Path
     environment = import_extra("jinja2").Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
     environment.filters["percent"] = lambda share, digits=1: f"{100 * share:.{digits}f} %"
     template = files(__package__).joinpath("page.html.j2").read_text(encoding="utf-8")
-    cases = _cases(over_seeds(runs))
+    groups = over_seeds(runs)
+    cases = _cases(groups)
     page = environment.from_string(template).render(
         cases=cases,
+        trust=_trust(groups) if len({group.run.scene for group in groups}) > 1 else [],
         worst=_worst(runs),
         scenes=sorted({case.run.scene.name for case in cases}),
         queries=sum(len(group.results) for case in cases for group in case.groups),
@@ -91,12 +99,19 @@ def _cases(groups: Sequence[Group]) -> list[Case]:
     return [_case(groups) for groups in together.values()]
 
 
+def _trust(groups: list[Group]) -> list[TrustRow]:
+    return trust_rows(groups) if any(condition_words(group.run) for group in groups) else []
+
+
 def _case(groups: list[Group]) -> Case:
     run = groups[0].run
-    named = [(group.label, group.results) for group in groups]
+    # Where much is compared, what nothing was done to.
+    drawn_groups = [group for group in groups if not condition_words(group.run)] if len(groups) > _MAX_DRAWN else groups
+    named = [(group.label, group.results) for group in (drawn_groups or groups)[:_MAX_DRAWN]]
+    trust = _trust(groups)
     if run.protocol in SWEEPS:
         curves = figures.success_curves(named, rotation=run.protocol == "sweep-rotation")
-        return Case(groups, None, [("Success against the error of the prior.", curves)])
+        return Case(groups, trust, None, [("Success against the error of the prior.", curves)])
     drawn = [
         (
             f"How large the errors are. The red line is the largest error of a success, {MAX_ROTATION_ERROR_DEG:g}° "
@@ -116,7 +131,7 @@ def _case(groups: list[Group]) -> Case:
     drawn.append(("Where the time goes.", figures.stage_times(named)))
     # The published table is of priors with sigma 1.
     published = published_table(run.scene.name) if run.protocol == "paper" and run.sigma == 1 else None
-    return Case(groups, published, drawn)
+    return Case(groups, trust, published, drawn)
 
 
 def _worst(runs: Sequence[RunResults]) -> list[tuple[str, list[WorstQuery]]]:

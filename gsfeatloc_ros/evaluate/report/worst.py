@@ -16,7 +16,7 @@ from gsfeatloc_ros.common.geometry import invert, transform
 from gsfeatloc_ros.evaluate.metrics import QueryResult
 from gsfeatloc_ros.evaluate.pictures import mark_matches, side_by_side
 from gsfeatloc_ros.evaluate.run import Task, open_renderer, open_scene, trace
-from gsfeatloc_ros.evaluate.tables import RunResults
+from gsfeatloc_ros.evaluate.tables import RunResults, condition_words
 from gsfeatloc_ros.match.base import Matches
 
 _MAX_QUERIES = 6
@@ -40,7 +40,8 @@ class WorstQuery:
         picture: the photo without distortion, the map at the prior, and the last view of the map that was compared with
             the photo (of the published recipe, the map at its answer), as a data URL of a JPEG; inliers have rings of
             one colour in the first and the last.
-        seen_at_prior: share of what the photo shows of the map that is in view from the prior.
+        seen_at_prior: share of what the photo shows of the map that is in view from the prior; NaN where it shows
+            nothing of it.
     """
 
     task: Task
@@ -48,10 +49,19 @@ class WorstQuery:
     picture: str
     seen_at_prior: float
 
+    @property
+    def condition(self) -> str:
+        """What was done to the photo and the map in words; "" for nothing."""
+        return ", ".join(condition_words(self.task.run))
+
 
 def worst_queries(runs: Sequence[RunResults]) -> list[WorstQuery]:
-    """Localize the worst queries of some runs again: wrong answers first, then no answers, then the largest errors."""
+    """Localize the worst queries of some runs again: wrong answers first, then no answers, then the largest errors.
+
+    That a photo which is not of the scene has no answer is as it should be.
+    """
     pairs = [pair for run in runs for pair in zip(run.tasks, run.results, strict=True)]
+    pairs = [(task, result) for task, result in pairs if result.answered or not task.run.negative]
     pairs.sort(key=lambda pair: (("wrong", "none", "right").index(pair[1].verdict), -pair[1].relative_error))
     bad = sum(result.verdict != "right" for _, result in pairs)
     return [_look(task, result) for task, result in pairs[: min(_MAX_QUERIES, max(_MIN_QUERIES, bad))]]
@@ -60,7 +70,7 @@ def worst_queries(runs: Sequence[RunResults]) -> list[WorstQuery]:
 def _look(task: Task, result: QueryResult) -> WorstQuery:
     run, prior = task.run, task.prior.T_map_camera
     truth = open_scene(run.scene, run.map_path, task.version).photos[task.prior.photo].T_map_camera
-    renderer = open_renderer(run.scene, run.map_path, task.version)
+    renderer = open_renderer(task.drawn_map)
     traced = trace(task)
     camera = traced.photo.camera
     prior_render = renderer.render(camera, prior)
@@ -73,8 +83,10 @@ def _look(task: Task, result: QueryResult) -> WorstQuery:
     if last_render is not None:
         matches = _scaled(traced.correspondences, camera, size)
         left, right = mark_matches(left, _resized(last_render.image(), size), matches)
-    views = [(renderer.render(camera, truth), truth), (prior_render, prior)]
-    seen = _share_in_view(camera, *((to_host(render.depth), pose) for render, pose in views))
+    seen = float("nan")
+    if not run.negative:
+        views = [(renderer.render(camera, truth), truth), (prior_render, prior)]
+        seen = _share_in_view(camera, *((to_host(render.depth), pose) for render, pose in views))
     return WorstQuery(task, result, _data_url(side_by_side([left, middle, right])), seen)
 
 

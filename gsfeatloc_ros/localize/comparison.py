@@ -1,0 +1,146 @@
+"""Photo and render at the estimate, compared both ways and cell by cell."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from gsfeatloc_ros.common.arrays import to_host
+from gsfeatloc_ros.common.camera import Camera
+from gsfeatloc_ros.common.local_structure import local_structure
+from gsfeatloc_ros.common.photo import Photo
+from gsfeatloc_ros.localize.query import MatchedView, Query
+from gsfeatloc_ros.pose.lift import lift
+from gsfeatloc_ros.pose.solve import Correspondences, reprojection_errors
+
+# Cells across and down the photo.
+CELLS = (16, 12)
+# Pictures are compared at this focal length in pixels, or their own if that is shorter: finer detail splats do not
+# draw, and what is compared is the same in a crop or a photo of another size.
+_FOCAL_LENGTH = 300.0
+# Standard deviation, in compared pixels, of the neighbourhood whose mean brightness and contrast are taken out.
+_NEIGHBOURHOOD = 12.0
+# Contrast (of 255) under which a neighbourhood says nothing: sky, a blank wall.
+_MIN_CONTRAST = 2.0
+# Pixels that are compared must be covered by the map, and seen by the lens.
+_MIN_ALPHA = 0.9
+_MIN_COVERED = 0.5
+# A cell is compared where so much of it is covered, and so much of that has contrast in one of the pictures.
+_MIN_COVERED_SHARE = 0.3
+_MIN_CONTRAST_SHARE = 0.5
+# Width, in compared pixels, of what is smoothed out of the mask of changes.
+_BRUSH = 7
+# Where the local structures of photo and render correlate less, the photo shows something else than the map.
+_MIN_CORRELATION = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """What photo and render have in common.
+
+    Attributes:
+        inlier_ratio: share of the photo's corners, of those that were found in the render and have a depth, that agree
+            with the pose.
+        render_inlier_ratio: the same of the render's corners in the photo; NaN where none was found.
+        agreeing, disagreeing: (12, 16) number of corners of either in each cell of the photo.
+        correlation: (12, 16) of the local structure of the two in each cell; NaN where there is nothing to compare.
+    """
+
+    inlier_ratio: float
+    render_inlier_ratio: float
+    agreeing: np.ndarray
+    disagreeing: np.ndarray
+    correlation: np.ndarray
+
+    def explained_correlation(self, quantile: float) -> float:
+        """Return a quantile of the correlation over the cells in which most corners agree; NaN without any."""
+        values = self.correlation[(self.agreeing > self.disagreeing) & np.isfinite(self.correlation)]
+        return float(np.quantile(values, quantile)) if len(values) else float("nan")
+
+    def changed_share(self) -> float:
+        """Return the share of the compared cells in which the photo shows something else than the map; NaN for none."""
+        compared = np.isfinite(self.correlation)
+        changed = (self.correlation < _MIN_CORRELATION) | (self.disagreeing > self.agreeing)
+        return float(changed[compared].mean()) if compared.any() else float("nan")
+
+
+def compare(query: Query, view: MatchedView, tolerance: float) -> Comparison:
+    """Compare a photo with the view from the estimate, which has a solution.
+
+    Corners agree with it that are off by at most `tolerance` pixels.
+    """
+    assert view.solution is not None
+    options, camera, pose = query.components.options, query.photo.camera, view.solution.T_map_camera
+    with query.clock.stage("track"):
+        back = query.tracker.track_back(view.image)
+    lifted = lift(view.render, camera, view.pose, back.b, options.lift)
+    valid = lifted.valid
+    found = Correspondences(back.a[valid], lifted.points[valid], lifted.sigmas[valid])
+    agrees = view.solution.errors <= tolerance
+    agrees_back = reprojection_errors(camera, pose, found) <= tolerance
+    pixels, all_agree = np.concatenate([view.found.pixels, found.pixels]), np.concatenate([agrees, agrees_back])
+    return Comparison(
+        inlier_ratio=float(agrees.mean()),
+        render_inlier_ratio=float(agrees_back.mean()) if len(agrees_back) else float("nan"),
+        agreeing=_count(pixels[all_agree], camera),
+        disagreeing=_count(pixels[~all_agree], camera),
+        correlation=_correlation(query.photo, view),
+    )
+
+
+def changed_mask(photo: Photo, view: MatchedView) -> np.ndarray:
+    """Return where the photo shows something else than the map: (H, W) uint8, 255 there and 0 elsewhere."""
+    structure_photo, structure_map, compared, _ = _structures(photo, view)
+    sums = (
+        cv2.GaussianBlur(np.where(compared, values, 0).astype(np.float32), (0, 0), 0.5 * _NEIGHBOURHOOD)
+        for values in (structure_photo * structure_map, structure_photo**2, structure_map**2)
+    )
+    product, square_photo, square_map = sums
+    alike = product >= _MIN_CORRELATION * np.sqrt(square_photo * square_map)
+    changed = (compared & ~alike).astype(np.uint8) * 255
+    # Specks and gaps narrower than what is compared mean nothing.
+    brush = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (_BRUSH, _BRUSH))
+    changed = cv2.morphologyEx(cv2.morphologyEx(changed, cv2.MORPH_CLOSE, brush), cv2.MORPH_OPEN, brush)
+    return cv2.resize(changed, (photo.camera.width, photo.camera.height), interpolation=cv2.INTER_NEAREST)
+
+
+def _count(pixels: np.ndarray, camera: Camera) -> np.ndarray:
+    """Count pixels (M, 2) by the cells in which they lie: (12, 16)."""
+    across, down = CELLS
+    columns = np.clip((pixels[:, 0] + 0.5) * across // camera.width, 0, across - 1).astype(int)
+    rows = np.clip((pixels[:, 1] + 0.5) * down // camera.height, 0, down - 1).astype(int)
+    return np.bincount(rows * across + columns, minlength=across * down).reshape(down, across)
+
+
+def _structures(photo: Photo, view: MatchedView) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return the local structure of photo and render, where they are covered and have contrast, and where covered."""
+    camera = photo.camera
+    scale = min(1.0, _FOCAL_LENGTH / camera.K[0, 0])
+    size = (max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
+    covered = photo.seen & (to_host(view.render.alpha) >= _MIN_ALPHA)
+    covered = cv2.resize(covered.astype(np.float32), size, interpolation=cv2.INTER_AREA) > _MIN_COVERED
+    (photo_structure, photo_contrast), (map_structure, map_contrast) = (
+        local_structure(cv2.resize(gray, size, interpolation=cv2.INTER_AREA), _NEIGHBOURHOOD, _MIN_CONTRAST)
+        for gray in (photo.gray(), cv2.cvtColor(to_host(view.image), cv2.COLOR_RGB2GRAY))
+    )
+    compared = covered & (np.maximum(photo_contrast, map_contrast) >= _MIN_CONTRAST)
+    return photo_structure, map_structure, compared, covered
+
+
+def _correlation(photo: Photo, view: MatchedView) -> np.ndarray:
+    """Return the correlation (12, 16) of photo and render in each cell; NaN where there is nothing to compare."""
+    a, b, compared, covered = _structures(photo, view)
+    height, width = a.shape
+    across, down = CELLS
+    rows, columns = np.arange(height) * down // height, np.arange(width) * across // width
+    cells = (rows[:, None] * across + columns)[covered]
+
+    def total(values: np.ndarray) -> np.ndarray:
+        return np.bincount(cells, values[covered], across * down)
+
+    area, covered_area = height * width / (across * down), total(np.ones_like(a))
+    enough = (covered_area >= _MIN_COVERED_SHARE * area) & (total(compared) >= _MIN_CONTRAST_SHARE * covered_area)
+    correlation = total(a * b) / np.sqrt(np.maximum(total(a * a) * total(b * b), np.finfo(np.float64).tiny))
+    return np.where(enough & (covered_area > 0), correlation, np.nan).reshape(down, across)

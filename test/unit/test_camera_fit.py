@@ -1,0 +1,107 @@
+"""A camera that is not as it was calibrated, told from exact matches."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from gsfeatloc_ros.common.camera import Camera
+from gsfeatloc_ros.common.geometry import invert, make_pose, so3_exp, so3_log, transform
+from gsfeatloc_ros.pose.camera_fit import _linearize, fit_camera
+from gsfeatloc_ros.pose.solve import Correspondences, PoseOptions, solve_pose
+
+CAMERA = Camera(640, 480, np.array([[600.0, 0, 315], [0, 610.0, 245], [0, 0, 1]]))
+POSE = make_pose(so3_exp(np.array([0.4, -1.1, 0.3])), np.array([2.0, -1.0, 0.5]))
+ROLLING = np.array([0.004, -0.012, 0.006])
+
+
+def seen(camera: Camera, k1: float = 0.0, rolling: np.ndarray | None = None, noise: float = 0.3) -> Correspondences:
+    """What a camera at POSE sees of random points, rows one after another where it is turned by `rolling` meanwhile."""
+    rng = np.random.default_rng(0)
+    points = transform(POSE, CAMERA.rays(rng.uniform([0, 0], [639, 479], (600, 2))) * rng.uniform(2, 8, (600, 1)))
+    pixels = np.full((600, 2), 240.0)
+    for _ in range(5):  # the row at which a point is read depends on where it is seen
+        when = (pixels[:, 1] + 0.5) / camera.height - 0.5
+        turned = [
+            POSE @ make_pose(so3_exp(t * (np.zeros(3) if rolling is None else rolling)), np.zeros(3)) for t in when
+        ]
+        in_camera = np.array([transform(invert(T), p[None])[0] for T, p in zip(turned, points, strict=True)])
+        slopes = in_camera[:, :2] / in_camera[:, 2:]
+        slopes = slopes * (1 + k1 * (slopes**2).sum(axis=1, keepdims=True))
+        pixels = slopes * camera.K[[0, 1], [0, 1]] + camera.K[:2, 2]
+    return Correspondences(pixels + noise * rng.normal(size=pixels.shape), points, np.zeros_like(points))
+
+
+def fitted(found: Correspondences):
+    """The fit from the pose that the calibration gives."""
+    solution = solve_pose(CAMERA, found, PoseOptions(max_reprojection_error=20.0), seed=0)
+    return fit_camera(CAMERA, solution.T_map_camera, found, PoseOptions()), solution
+
+
+def longer(error: float) -> Camera:
+    return replace(CAMERA, K=CAMERA.K @ np.diag([1 + error, 1 + error, 1]))
+
+
+def test_a_right_calibration_reads_as_right() -> None:
+    fit, _ = fitted(seen(CAMERA))
+    assert abs(fit.focal) < 3 * fit.focal_sigma < 0.01
+    assert abs(fit.k1) < 3 * fit.k1_sigma
+    assert (np.abs(fit.rolling) < 3 * fit.rolling_sigma).all()
+
+
+@pytest.mark.parametrize("error", [-0.1, -0.02, 0.01, 0.05])
+def test_the_focal_length_is_told(error: float) -> None:
+    fit, solution = fitted(seen(longer(error)))
+    assert fit.focal == pytest.approx(error, abs=0.003)
+    assert 0 < fit.focal_sigma < 0.01
+    # What the pose would be moved by is what it is off by.
+    moved = make_pose(
+        so3_exp(fit.pose_shift[3:]) @ solution.T_map_camera[:3, :3], solution.T_map_camera[:3, 3] + fit.pose_shift[:3]
+    )
+    off = np.linalg.norm(solution.T_map_camera[:3, 3] - POSE[:3, 3])
+    assert np.linalg.norm(moved[:3, 3] - POSE[:3, 3]) < 0.2 * off
+
+
+def test_radial_distortion_is_told() -> None:
+    fit, _ = fitted(seen(CAMERA, k1=-0.05))
+    assert fit.k1 == pytest.approx(-0.05, abs=0.01)
+
+
+def test_a_rolling_shutter_is_told() -> None:
+    fit, _ = fitted(seen(CAMERA, rolling=ROLLING))
+    np.testing.assert_allclose(fit.rolling, ROLLING, atol=1.5e-3)
+
+
+def test_jacobians_equal_finite_differences() -> None:
+    found = seen(CAMERA).select(np.arange(30))
+    extra = np.array([0.02, 0.0, 0.0, 0.0, 0.0])  # how the others change the slope is left out: they are small
+
+    def residuals(step: np.ndarray) -> np.ndarray:
+        pose = make_pose(so3_exp(step[3:6]) @ POSE[:3, :3], POSE[:3, 3] + step[:3])
+        return _linearize(CAMERA, pose, extra + step[6:], found)[0]
+
+    _, jacobian = _linearize(CAMERA, POSE, extra, found)
+    size = 1e-6
+    for column, step in enumerate(size * np.eye(11)):
+        slope = (residuals(step) - residuals(-step)) / (2 * size)
+        np.testing.assert_allclose(jacobian[:, :, column], slope, rtol=1e-4, atol=1e-3)
+
+
+def test_points_behind_the_camera_are_no_fit() -> None:
+    found = seen(CAMERA)
+    found.points[0] = transform(POSE, np.array([[0, 0, -1.0]]))[0]
+    assert fit_camera(CAMERA, POSE, found, PoseOptions()) is None
+
+
+def test_the_shift_is_in_the_axes_of_the_map() -> None:
+    fit, solution = fitted(seen(longer(0.03)))
+    step = so3_log(POSE[:3, :3] @ solution.T_map_camera[:3, :3].T)
+    assert np.linalg.norm(fit.pose_shift[3:] - step) < 0.002
+
+
+def test_matches_that_determine_no_pose_are_no_fit() -> None:
+    found = Correspondences(np.full((30, 2), 100.0), np.full((30, 3), 5.0), np.zeros((30, 3)))
+    fit = fit_camera(CAMERA, make_pose(np.eye(3), np.zeros(3)), found, PoseOptions())
+    assert fit is None or np.isfinite(fit.pose_shift).all()

@@ -1,0 +1,94 @@
+"""Photo and render at the estimate, compared both ways and cell by cell."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from gsfeatloc_ros.common.camera import Camera
+from gsfeatloc_ros.common.photo import Photo
+from gsfeatloc_ros.common.stage_clock import StageClock
+from gsfeatloc_ros.localize.comparison import CELLS, Comparison, changed_mask, compare
+from gsfeatloc_ros.localize.options import LocalizerOptions
+from gsfeatloc_ros.localize.query import Components, MatchedView, Query
+from gsfeatloc_ros.match import create_matcher, create_tracker
+from gsfeatloc_ros.render import create_renderer
+
+
+@pytest.fixture(scope="module")
+def components(room_map) -> Components:
+    return Components(create_renderer(room_map), create_matcher("sift"), create_tracker, LocalizerOptions())
+
+
+def compared(components, image: np.ndarray, camera: Camera, pose: np.ndarray) -> tuple[Comparison, Query, MatchedView]:
+    """A photo compared with the map seen from a pose."""
+    query = Query(components, Photo.undistorted(image, camera, 640), StageClock())
+    view = query.track(pose)
+    return compare(query, view, 3.0), query, view
+
+
+def covered(image: np.ndarray) -> np.ndarray:
+    """The photo with a third of it, in the middle, covered by noise."""
+    image = image.copy()
+    patch = np.random.default_rng(0).integers(0, 255, (60, 80, 3), dtype=np.uint8)
+    image[110:370, 170:480] = cv2.resize(patch, (310, 260), interpolation=cv2.INTER_CUBIC)
+    return image
+
+
+def test_a_photo_agrees_with_the_map_at_the_truth(components, room_camera, room_photos) -> None:
+    comparison, *_ = compared(components, room_photos[0].image, room_camera, room_photos[0].T_map_camera)
+    assert comparison.inlier_ratio > 0.95
+    assert comparison.render_inlier_ratio > 0.95
+    assert comparison.explained_correlation(0.5) > 0.9
+    assert comparison.explained_correlation(0.25) > 0.8
+    assert comparison.changed_share() < 0.1
+    assert comparison.correlation.shape == comparison.agreeing.shape == CELLS[::-1]
+    assert comparison.agreeing.sum() > 10 * comparison.disagreeing.sum()
+
+
+@pytest.mark.parametrize("gain", [0.5, 1.3])
+@pytest.mark.parametrize("gamma", [0.7, 1.5])
+def test_exposure_does_not_count(components, room_camera, room_photos, gain: float, gamma: float) -> None:
+    image = room_photos[0].image
+    exposed = (255 * np.clip(gain * (image / 255.0) ** gamma, 0, 1)).astype(np.uint8)
+    usual, *_ = compared(components, image, room_camera, room_photos[0].T_map_camera)
+    comparison, *_ = compared(components, exposed, room_camera, room_photos[0].T_map_camera)
+    assert comparison.explained_correlation(0.5) > usual.explained_correlation(0.5) - 0.1
+
+
+def test_what_is_covered_is_told_apart(components, room_camera, room_photos) -> None:
+    photo = room_photos[0]
+    comparison, query, view = compared(components, covered(photo.image), room_camera, photo.T_map_camera)
+    assert comparison.explained_correlation(0.5) > 0.9
+    mask = changed_mask(query.photo, view)
+    assert mask.shape == (480, 640)
+    assert mask.dtype == np.uint8
+    assert set(np.unique(mask)) == {0, 255}
+    inside, outside = mask[140:340, 210:440] > 0, np.delete(mask, np.s_[90:390], axis=0) > 0
+    assert inside.mean() > 0.7
+    assert outside.mean() < 0.1
+    assert 0.15 < comparison.changed_share() < 0.45
+
+
+def test_the_same_in_a_small_photo(components, room_camera, room_photos) -> None:
+    small = cv2.resize(room_photos[0].image, (160, 120), interpolation=cv2.INTER_AREA)
+    comparison, query, _ = compared(components, small, room_camera.scaled(160, 120), room_photos[0].T_map_camera)
+    assert query.photo.camera.K[0, 0] == pytest.approx(500, rel=0.02)
+    assert comparison.inlier_ratio > 0.9
+    assert comparison.explained_correlation(0.5) > 0.85
+
+
+def test_a_blank_photo_has_nothing_to_compare(components, room_camera, room_photos) -> None:
+    photo = room_photos[0]
+    query = Query(components, Photo.undistorted(photo.image, room_camera, 640), StageClock())
+    view = query.track(photo.T_map_camera)
+    blank = replace(query.photo, image=np.full_like(query.photo.image, 128))
+    view = replace(view, image=np.full_like(query.photo.image, 128))
+    assert not changed_mask(blank, view).any()
+    comparison = compare(replace(query, photo=blank), view, 3.0)
+    assert np.isnan(comparison.correlation).all()
+    assert np.isnan(comparison.explained_correlation(0.5))
+    assert np.isnan(comparison.changed_share())
