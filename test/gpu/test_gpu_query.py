@@ -78,7 +78,7 @@ def test_no_picture_leaves_the_gpu_before_there_is_an_estimate(gpu, renderer, ro
     gpu.reset()
     estimate = localizer.localize(image, room_camera, photo.T_map_camera_prior)
     assert estimate.status is Status.LOCALIZED
-    # On the host the first render at an estimate shows whether the photo is blurred; verification compares pictures too.
+    # On the host, the first render at an estimate shows whether the photo is blurred; verification compares pictures.
     assert max(gpu.to_host) > SMALL, gpu.explain()
     before = list(takewhile(lambda size: size <= SMALL, gpu.to_host))
     # The photo's corners; of the render at the prior and the first at an estimate, matches and the depths under them.
