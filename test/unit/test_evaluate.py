@@ -148,6 +148,7 @@ def test_uniform_protocols_draw_priors_in_their_ranges(scene, protocol, repetiti
     np.testing.assert_allclose(half, np.array([turns, moves]) / 2, atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("protocol", ["paper", "chen", "near-miss"])
 def test_covariance_of_a_prior_is_that_of_the_errors(scene, protocol):
     many = replace(scene, photos=scene.photos[1:2] * 2000)

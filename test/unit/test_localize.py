@@ -148,6 +148,7 @@ def test_an_answer_far_from_the_prior_is_rejected(sift_localizer, room_camera, r
     assert "standard deviations from the prior" in estimate.reason
 
 
+@pytest.mark.slow
 def test_the_estimate_is_verified_by_the_render_there(renderer, room_camera, room_photos) -> None:
     """What it is asked for and does not have is said; the pose is kept back."""
     photo = room_photos[0]

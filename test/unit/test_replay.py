@@ -124,6 +124,7 @@ def test_answers_are_those_of_the_localizer(room_camera, room_photos, room_map_f
     assert not (tmp_path / "out" / "errors.png").exists()
 
 
+@pytest.mark.slow
 def test_other_types_of_messages(room_camera, room_photos, room_map_file, tmp_path, capsys):
     photo = room_photos[0]
     step = make_pose(so3_exp(np.array([0.0, 0.0, 0.1])), [0.02, 0.0, 0.0])
@@ -248,6 +249,7 @@ def test_images_that_cannot_be_used_are_lines(room_camera, room_photos, room_map
     assert "truth messages that cannot be used:\n    1 x the bytes" in said
 
 
+@pytest.mark.slow
 def test_an_exception_is_a_line_and_an_interruption_keeps_what_came_before(
     room_camera, room_photos, room_map_file, tmp_path, monkeypatch, capsys
 ):
@@ -345,6 +347,7 @@ def test_bags_that_cannot_be_used(storage, room_camera, room_photos, room_map_fi
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_what_comes_before_a_damage_is_kept(room_camera, room_photos, room_map_file, tmp_path, capsys):
     write_bag(tmp_path / "bag", room_camera, room_photos[:4], StoragePlugin.SQLITE3)
     file = tmp_path / "bag" / "bag.db3"

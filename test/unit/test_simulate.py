@@ -143,6 +143,7 @@ def test_walk_keeps_clear_of_everything(room, seed, time):
     assert pose[2, 1] < -0.8
 
 
+@pytest.mark.slow
 def test_no_photos(room, room_camera):
     assert simulate_photos(room, room_camera, count=0) == []
 
@@ -160,6 +161,7 @@ def test_photos_have_priors_in_free_space(room, room_camera, room_photos):
         assert room.is_free(photo.T_map_camera_prior[None, :3, 3], MIN_CLEARANCE)[0]
 
 
+@pytest.mark.slow
 def test_photos_of_a_seed_are_the_same(room, room_camera, room_photos):
     (again,) = simulate_photos(room, room_camera, count=1, seed=0)
     np.testing.assert_array_equal(again.image, room_photos[0].image)
@@ -190,6 +192,7 @@ def test_still_photo_is_what_the_tracer_sees_but_for_light_and_noise(room, small
     assert psnr(photo, gains * seen) > 28
 
 
+@pytest.mark.slow
 def test_photos_differ_in_exposure_and_noise(photographer, room_photos):
     pose = room_photos[0].T_map_camera
     photos = [take_photo(photographer, lambda time: pose, seed) for seed in range(4)]
