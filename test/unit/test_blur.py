@@ -35,6 +35,7 @@ def main_direction(kernel: np.ndarray) -> float:
     return float(np.degrees(np.arctan2(longest[1], longest[0])) % 180)
 
 
+@pytest.mark.slow
 def test_a_sharp_picture_is_not_blurred(sharp) -> None:
     assert estimate_blur(sharp, sharp) is None
 

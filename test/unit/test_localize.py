@@ -222,6 +222,7 @@ def test_a_blurred_photo_is_compared_with_a_render_blurred_alike(
     assert translation_error(estimate.T_map_camera, photo.T_map_camera) < 0.05
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("error", [-0.05, 0.05])
 def test_a_wrong_focal_length_is_refused_and_told(sift_localizer, room_camera, room_photos, error: float) -> None:
     told = 0
