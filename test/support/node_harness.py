@@ -41,7 +41,7 @@ from gsfeatloc_ros.simulate import SimulatedPhoto
 # How long to listen before saying that nothing was published.
 SILENCE = 1.0
 # Whom a client has found may take so long to find the client too: what is sent before that is lost.
-SETTLING = 0.25
+SETTLING = 0.5
 # Best effort may lose an image: it is sent again after this.
 RESEND_PERIOD = 3.0
 
