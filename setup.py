@@ -33,6 +33,7 @@ setup(
     python_requires=">=3.11,<3.13",
     install_requires=[
         "backports.zstd>=1.0,<2",  # .spz of version 4; in the standard library from Python 3.14 on
+        "faiss-cpu>=1.9,<2",  # nearest neighbours among the features of an index of views
         "kornia>=0.9,<0.10",  # the first whose LoFTR gives an image's features apart
         "numba>=0.60,<0.70",
         "numpy>=1.26,<3",
@@ -40,6 +41,7 @@ setup(
         "plyfile>=1.0,<2",
         "poselib>=2.0.4,<3",
         "rosbags>=0.11,<0.12",
+        "scipy>=1.11,<2",
         "torch>=2.5.1,<3",
         "tqdm>=4.60,<5",
     ],

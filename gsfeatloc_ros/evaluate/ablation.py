@@ -6,6 +6,7 @@ would do without them on a robot.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
@@ -15,8 +16,8 @@ from gsfeatloc_ros.common.arrays import Array
 from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.photo import Photo
 from gsfeatloc_ros.localize.localizer import Localizer
-from gsfeatloc_ros.localize.options import LocalizerOptions
-from gsfeatloc_ros.match import Matcher, Matches, create_tracker
+from gsfeatloc_ros.localize.query import Components
+from gsfeatloc_ros.match import Matcher, Matches, Tracker, create_tracker
 from gsfeatloc_ros.pose.lift import LiftOptions
 from gsfeatloc_ros.render.base import Render, Renderer
 
@@ -28,26 +29,27 @@ _NO_DEPTH_GATING = LiftOptions(min_alpha=0.0, max_depth_step=float("inf"))
 _NO_ROBUST_LOSS_SCALE = 1e3
 
 
-def ablated_localizer(renderer: Renderer, matcher: Matcher, options: LocalizerOptions, ablation: str = "") -> Localizer:
+def ablated_localizer(components: Components, ablation: str = "") -> Localizer:
     """Make a localizer without one of ABLATIONS; "" for the whole one.
 
     Raises:
         ValueError: an unknown ablation.
     """
+    renderer, matcher, options = components.renderer, components.matcher, components.options
+    create_tracker: Callable[[Photo, str], Tracker] = components.create_tracker
     if ablation == "tracking":
-        return Localizer(renderer, matcher, options, create_tracker=partial(FeatureTracker, matcher))
-    if ablation == "sub-pixel":
-        return Localizer(renderer, matcher, options, create_tracker=WholePixelTracker)
-    if ablation == "median-depth":
-        return Localizer(MeanDepthRenderer(renderer), matcher, options)
-    if ablation == "depth-gating":
-        return Localizer(renderer, matcher, replace(options, lift=_NO_DEPTH_GATING))
-    if ablation == "robust-loss":
-        pose = replace(options.pose, cauchy_scale=_NO_ROBUST_LOSS_SCALE)
-        return Localizer(renderer, matcher, replace(options, pose=pose))
-    if ablation:
+        create_tracker = partial(FeatureTracker, matcher)
+    elif ablation == "sub-pixel":
+        create_tracker = WholePixelTracker
+    elif ablation == "median-depth":
+        renderer = MeanDepthRenderer(renderer)
+    elif ablation == "depth-gating":
+        options = replace(options, lift=_NO_DEPTH_GATING)
+    elif ablation == "robust-loss":
+        options = replace(options, pose=replace(options.pose, cauchy_scale=_NO_ROBUST_LOSS_SCALE))
+    elif ablation:
         raise ValueError(f"ablation {ablation!r} is not one of {', '.join(ABLATIONS)}")
-    return Localizer(renderer, matcher, options)
+    return Localizer(renderer, matcher, options, index=components.index, create_tracker=create_tracker)
 
 
 class FeatureTracker:
@@ -89,7 +91,7 @@ class MeanDepthRenderer:
 
     def __init__(self, renderer: Renderer) -> None:
         self._renderer = renderer
-        self.device = renderer.device
+        self.device, self.solid_points = renderer.device, renderer.solid_points
 
     def render(self, camera: Camera, T_map_camera: np.ndarray) -> Render:
         """Render the map from the pose `T_map_camera` (4, 4)."""

@@ -52,6 +52,11 @@ class Scene:
         """The camera of the first photo; most scenes have no other."""
         return self.photos[0].camera
 
+    def training_poses(self) -> np.ndarray:
+        """Return the poses (T, 4, 4) of the frames that are none of the photos."""
+        photos = np.array([photo.T_map_camera for photo in self.photos])
+        return np.array([pose for pose in self.trajectory if not np.isclose(pose, photos).all(axis=(1, 2)).any()])
+
     def read_photo(self, photo: PosedPhoto) -> np.ndarray:
         """Read a photo as RGB (H, W, 3) uint8, composited on the background where it has an alpha channel.
 

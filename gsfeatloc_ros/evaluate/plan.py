@@ -9,6 +9,7 @@ from pathlib import Path
 
 from gsfeatloc_ros.evaluate.dataset import Scene
 from gsfeatloc_ros.evaluate.metrics import QueryResult
+from gsfeatloc_ros.evaluate.protocol import WITHOUT_PRIOR
 from gsfeatloc_ros.evaluate.record import Fingerprint, Record, SceneHash, fingerprint_of, hash_photos, hash_scene
 from gsfeatloc_ros.evaluate.run import (
     PRIORS_FILE,
@@ -33,6 +34,7 @@ class Combinations:
         conditions: what is done to the photos, priors and maps.
         priors_file: for the protocol PRIORS_FILE.
         max_width: as in Run, one for all.
+        index: as in Run; None for an index of the map where priors need one.
         options: values by the name of a parameter of LocalizerOptions.
         methods, matchers, sigmas, seeds, ablations: as in Run.
     """
@@ -47,6 +49,7 @@ class Combinations:
     max_width: int
     options: dict[str, list[float]]
     ablations: Sequence[str] = ("",)
+    index: str | None = None
 
     def runs(self) -> list[Run]:
         """Return all combinations, those next to each other that need the same map and matcher."""
@@ -68,6 +71,7 @@ class Combinations:
                 corruption=condition.corruption,
                 degradation=condition.degradation,
                 negative=negative,
+                index=self.index or ("map" if condition.protocol in WITHOUT_PRIOR else "none"),
             )
             for scene, map_path in self.scenes
             for degradation in dict.fromkeys(condition.degradation for condition in self.conditions)

@@ -32,12 +32,14 @@ class PhotoPrior:
         T_map_camera: (4, 4) the pose.
         covariance: (6, 6) of the protocol's errors, as one knows it of a prior in practice: x y z and rotation about
             x y z, axes of the map frame, map units and radians; None if it is not known.
+        given: whether the localizer is told of it; otherwise it only says how far off one is who knows nothing.
     """
 
     photo: int
     step: int
     T_map_camera: np.ndarray
     covariance: np.ndarray | None = None
+    given: bool = True
 
 
 @dataclass(frozen=True)
@@ -116,6 +118,17 @@ def near_miss(scene: Scene, sigma: float, seed: int) -> list[PhotoPrior]:
     return _uniform(scene, sigma, seed, _Ranges(_NEAR_MISS_ROTATION_DEG, _NEAR_MISS_TRANSLATION, 1))
 
 
+def kidnapped(scene: Scene, sigma: float, seed: int) -> list[PhotoPrior]:
+    """Draw the pose of a random other photo for each, with the covariance of `paper`: the camera was carried away."""
+    covariance = paper_prior_error(scene, sigma).covariance
+    return [PhotoPrior(index, 0, pose, covariance) for index, pose in enumerate(_poses_of_others(scene, seed))]
+
+
+def no_prior(scene: Scene, sigma: float, seed: int) -> list[PhotoPrior]:
+    """Give no prior; one who guesses is as far off as another photo."""
+    return [PhotoPrior(index, 0, pose, given=False) for index, pose in enumerate(_poses_of_others(scene, seed))]
+
+
 def sweep_rotation(scene: Scene, sigma: float, seed: int) -> list[PhotoPrior]:
     """Pan every photo to the right by 0 to `sigma` times the rotation of `paper_bounds`, in ten steps."""
     angles = _steps(sigma * paper_bounds(scene)[0])
@@ -132,9 +145,13 @@ PROTOCOLS: dict[str, Callable[[Scene, float, int], list[PhotoPrior]]] = {
     "paper": paper,
     "chen": chen,
     "near-miss": near_miss,
+    "kidnapped": kidnapped,
+    "no-prior": no_prior,
     "sweep-rotation": sweep_rotation,
     "sweep-translation": sweep_translation,
 }
+WITHOUT_PRIOR = ("kidnapped", "no-prior")
+"""Those in which no view near the prior shows the photo."""
 SWEEPS = ("sweep-rotation", "sweep-translation")
 
 
@@ -162,6 +179,13 @@ def _uniform(scene: Scene, sigma: float, seed: int, ranges: _Ranges) -> list[Pho
             rotation = sigma * np.radians(rng.uniform(*ranges.rotation_deg)) * random_unit_vector(rng)
             priors.append(PhotoPrior(index, repetition, _moved(photo.T_map_camera, rotation, translation), covariance))
     return priors
+
+
+def _poses_of_others(scene: Scene, seed: int) -> list[np.ndarray]:
+    """Draw for each photo the pose (4, 4) of another, its own where there is no other."""
+    count = len(scene.photos)
+    steps = np.random.default_rng(seed).integers(1, max(count, 2), size=count)
+    return [scene.photos[(index + step) % count].T_map_camera for index, step in enumerate(steps)]
 
 
 def _steps(bound: float) -> np.ndarray:

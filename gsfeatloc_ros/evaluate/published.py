@@ -42,7 +42,7 @@ class PublishedLocalizer:
         self,
         image: np.ndarray,
         camera: Camera,
-        T_map_camera_prior: np.ndarray,
+        T_map_camera_prior: np.ndarray | None = None,
         prior_covariance: np.ndarray | None = None,
         interrupted: Callable[[], bool] = lambda: False,
     ) -> Estimate:
@@ -58,6 +58,8 @@ class PublishedLocalizer:
         Raises:
             Interrupted: `interrupted` said so.
         """
+        if T_map_camera_prior is None:
+            return Estimate(Status.FAILED, "the published recipe needs a prior")
         image, camera = camera.limit(image, self._max_image_width)
         _give_up_if(interrupted)
         render = self._renderer.render(camera, T_map_camera_prior)
@@ -93,7 +95,7 @@ class PublishedLocalizer:
         self,
         image: np.ndarray,
         camera: Camera,
-        T_map_camera_prior: np.ndarray,
+        T_map_camera_prior: np.ndarray | None = None,
         prior_covariance: np.ndarray | None = None,
         interrupted: Callable[[], bool] = lambda: False,
     ) -> Trace:

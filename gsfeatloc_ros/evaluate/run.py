@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -13,6 +14,7 @@ import cv2
 import numpy as np
 
 from gsfeatloc_ros.common.camera import Camera
+from gsfeatloc_ros.common.kernel_cache import hash_of_sources, user_cache_folder
 from gsfeatloc_ros.common.parameter import Value, settings_from
 from gsfeatloc_ros.evaluate.ablation import ablated_localizer
 from gsfeatloc_ros.evaluate.corruptions import corrupt
@@ -25,16 +27,21 @@ from gsfeatloc_ros.evaluate.priors_file import read_priors
 from gsfeatloc_ros.evaluate.protocol import PROTOCOLS, PhotoPrior, trajectory_radius
 from gsfeatloc_ros.evaluate.published import PublishedLocalizer
 from gsfeatloc_ros.evaluate.scene import load_degraded_renderer, load_scene, load_scene_renderer
+from gsfeatloc_ros.index import IndexOptions, ViewIndex, build_index
+from gsfeatloc_ros.index.storage import SUFFIX, load_index, save_index
 from gsfeatloc_ros.localize.engine import load_matcher
 from gsfeatloc_ros.localize.estimate import Trace
 from gsfeatloc_ros.localize.localizer import Localizer
 from gsfeatloc_ros.localize.options import LocalizerOptions
+from gsfeatloc_ros.localize.query import Components
 from gsfeatloc_ros.localize.settings import MatcherSettings, RendererSettings
-from gsfeatloc_ros.match import Matcher
+from gsfeatloc_ros.match import Matcher, create_tracker
 from gsfeatloc_ros.render import Renderer
 
 METHODS = ("default", "published")
 PRIORS_FILE = "priors-file"
+INDICES = ("none", "map", "poses")
+"""What an index of views is made of: there is none; the map alone; the poses of the training photos as well."""
 
 
 @dataclass(frozen=True)
@@ -56,6 +63,7 @@ class Run:
         corruption: the one of CORRUPTIONS that is done to the photos, or "".
         degradation: the one of DEGRADATIONS that is done to the map, or "".
         negative: what the photos are in place of the scene's own: one of NEGATIVES, the folder of another scene, or "".
+        index: the one of INDICES in which method "default" looks for what the prior does not show.
     """
 
     scene: Path
@@ -72,6 +80,7 @@ class Run:
     corruption: str = ""
     degradation: str = ""
     negative: str = ""
+    index: str = "none"
 
     def settings(self) -> dict[str, Any]:
         """Return the same, ready for JSON."""
@@ -177,7 +186,7 @@ def localize(task: Task, threads: int = 0) -> QueryResult:
     run, prior = task.run, task.prior
     localizer = _localizer(_localizer_of(run), task.drawn_map, threads)
     start, cpu_start = time.perf_counter(), time.process_time()
-    estimate = localizer.localize(image, camera, prior.T_map_camera, prior.covariance)
+    estimate = localizer.localize(image, camera, *_given(prior))
     cost = Cost(1000.0 * (time.perf_counter() - start), 1000.0 * (time.process_time() - cpu_start))
     photo = replace(scene.photos[prior.photo], name=task.photo)
     scoring = Scoring(trajectory_radius(scene), run.method == "published", bool(run.negative))
@@ -188,7 +197,12 @@ def trace(task: Task) -> Trace:
     """Localize from one prior, and keep the pictures that the estimate was made from."""
     _, (image, camera) = _open(task)
     localizer = _localizer(_localizer_of(task.run), task.drawn_map, threads=0)
-    return localizer.trace(image, camera, task.prior.T_map_camera, task.prior.covariance)
+    return localizer.trace(image, camera, *_given(task.prior))
+
+
+def _given(prior: PhotoPrior) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """Return the pose and the covariance that the localizer is told."""
+    return (prior.T_map_camera, prior.covariance) if prior.given else (None, None)
 
 
 @lru_cache(maxsize=1)
@@ -224,16 +238,35 @@ def _localizer(run: Run, drawn: DrawnMap, threads: int) -> Localizer | Published
         cv2.setNumThreads(threads)
     scene = open_scene(drawn.scene, drawn.map_path, drawn.version)
     renderer = open_renderer(drawn, threads)
-    localizer = _create_localizer(run, renderer, _matcher(run.matcher, renderer.device))
+    localizer = _create_localizer(run, drawn, renderer, _matcher(run.matcher, renderer.device))
     # What is compiled or loaded at the first call does not count.
     localizer.localize(scene.read_photo(scene.photos[0]), scene.camera, scene.photos[0].T_map_camera)
     return localizer
 
 
-def _create_localizer(run: Run, renderer: Renderer, matcher: Matcher) -> Localizer | PublishedLocalizer:
+def _create_localizer(
+    run: Run, drawn: DrawnMap, renderer: Renderer, matcher: Matcher
+) -> Localizer | PublishedLocalizer:
     if run.method == "published":
         return PublishedLocalizer(renderer, matcher, run.max_width)
-    return ablated_localizer(renderer, matcher, run.localizer_options(), run.ablation)
+    index = None if run.index == "none" else _index(run, drawn, renderer, matcher)
+    return ablated_localizer(
+        Components(renderer, matcher, create_tracker, run.localizer_options(), index), run.ablation
+    )
+
+
+def _index(run: Run, drawn: DrawnMap, renderer: Renderer, matcher: Matcher) -> ViewIndex:
+    """Make the index of views of a run's map by the run's seed, or read it where that was done before."""
+    scene = open_scene(drawn.scene, drawn.map_path, drawn.version)
+    poses = scene.training_poses() if run.index == "poses" else None
+    made_of = (str(drawn), run.matcher, run.index, run.seed, hash_of_sources("index", "match", "render", "maps"))
+    name = hashlib.sha256(repr(made_of).encode()).hexdigest()[:16]
+    path = user_cache_folder() / "evaluate" / f"{scene.name}-{name}{SUFFIX}"
+    index = load_index(path)
+    if index is None:
+        index = build_index(renderer, matcher, IndexOptions(seed=run.seed), poses=poses)
+        save_index(path, index, {"made of": made_of})
+    return index
 
 
 def _open(task: Task) -> tuple[Scene, tuple[np.ndarray, Camera]]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+from gsfeatloc_ros.index import ViewIndex
 from gsfeatloc_ros.localize.first_run import warm_up
 from gsfeatloc_ros.localize.localizer import Localizer
 from gsfeatloc_ros.localize.options import LocalizerOptions
@@ -24,25 +25,31 @@ class Engine:
         renderer: of the map.
         matcher: of features.
         options: of the localizer.
+        index: of views of the map; None where there is none.
     """
 
     map_path: str
     renderer: Renderer
     matcher: Matcher
     options: LocalizerOptions
+    index: ViewIndex | None = None
 
     @cached_property
     def localizer(self) -> Localizer:
         """The localizer."""
-        return Localizer(self.renderer, self.matcher, self.options)
+        return Localizer(self.renderer, self.matcher, self.options, index=self.index)
 
     def with_options(self, options: LocalizerOptions) -> Engine:
         """Return the same with other options."""
         return replace(self, options=options)
 
     def with_map(self, map_path: str, renderer: Renderer) -> Engine:
-        """Return the same with another map."""
-        return replace(self, map_path=map_path, renderer=renderer)
+        """Return the same with another map, of which there is no index yet."""
+        return replace(self, map_path=map_path, renderer=renderer, index=None)
+
+    def with_index(self, index: ViewIndex | None) -> Engine:
+        """Return the same with an index of views of the map."""
+        return replace(self, index=index)
 
 
 def load_renderer(

@@ -21,6 +21,7 @@ class Status(Enum):
     LOCALIZED = "localized"
     REJECTED = "rejected"
     FAILED = "failed"
+    AMBIGUOUS = "ambiguous"
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,13 +30,15 @@ class Estimate:
 
     Attributes:
         status: LOCALIZED: the pose is an answer. REJECTED: a pose was found, but the map seen from there does not match
-            the photo. FAILED: no pose was found. Neither has an answer; the prior is never passed off as one.
+            the photo. FAILED: no pose was found. AMBIGUOUS: several poses explain it equally well. None of these three
+            has an answer; the prior is never passed off as one.
         reason: one sentence in words, for a log or a diagnostic.
         T_map_camera: (4, 4) float64 pose of the camera (optical axes) in the map frame; None unless LOCALIZED.
         covariance: (6, 6) float64 in ROS order (x y z, rotation about x y z), translation in map units, rotation in
             radians, both about the axes of the map frame at the camera centre; None unless LOCALIZED.
         evidence: the numbers behind it.
         milliseconds: wall time of each stage by name, with "total".
+        candidates: (4, 4) poses that explain the photo equally well; none unless AMBIGUOUS.
     """
 
     status: Status
@@ -44,6 +47,7 @@ class Estimate:
     covariance: np.ndarray | None = None
     evidence: Evidence = field(default_factory=Evidence)
     milliseconds: dict[str, float] = field(default_factory=dict)
+    candidates: tuple[np.ndarray, ...] = ()
 
     @property
     def protection(self) -> ProtectionLevel | None:

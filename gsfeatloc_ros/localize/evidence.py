@@ -53,6 +53,8 @@ class Evidence:
         probability_wrong: that the pose is wrong.
         passes: number of renders at estimates.
         views: number of other views than the prior's that were searched.
+        searched: number of the index's views that were compared with the photo.
+        index_views: number of views in the index.
     """
 
     corners: int = 0
@@ -73,6 +75,8 @@ class Evidence:
     probability_wrong: float = float("nan")
     passes: int = 0
     views: int = 0
+    searched: int = 0
+    index_views: int = 0
 
     def numbers(self) -> dict[str, int | float]:
         """Return the numbers by name, in the order of the attributes."""

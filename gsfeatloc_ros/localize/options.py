@@ -13,6 +13,18 @@ from gsfeatloc_ros.pose.solve import PoseOptions
 
 
 @dataclass(frozen=True)
+class SearchOptions:
+    """How the index of views is searched, where the prior's view does not show the image."""
+
+    max_seconds: float = parameter(
+        3.0, "Longest search of the index, in seconds; what was begun by then is ended.", (0.0, 3600.0), live=True
+    )
+    max_views: int = parameter(
+        40, "Most views of the index that are compared with an image; 0 for none.", (0, 1_000_000), live=True
+    )
+
+
+@dataclass(frozen=True)
 class LocalizerOptions:
     """Settings of a Localizer; the node has them, and those of `pose` and `limits`, as parameters `localizer.*`."""
 
@@ -30,6 +42,7 @@ class LocalizerOptions:
     seed: int = parameter(
         0, "Seed of RANSAC and of the search: the same seed gives the same answer.", (0, 2**31 - 1), live=True
     )
+    search: SearchOptions = field(default_factory=SearchOptions)
     pose: PoseOptions = field(default_factory=PoseOptions)
     limits: Limits = field(default_factory=Limits)
     lift: LiftOptions = field(default_factory=LiftOptions)

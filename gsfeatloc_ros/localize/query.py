@@ -14,6 +14,7 @@ from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.geometry import invert, transform
 from gsfeatloc_ros.common.photo import Photo
 from gsfeatloc_ros.common.stage_clock import StageClock
+from gsfeatloc_ros.index import ViewIndex
 from gsfeatloc_ros.localize.blur import Blur
 from gsfeatloc_ros.localize.options import LocalizerOptions
 from gsfeatloc_ros.match.base import Matcher, Matches, Tracker
@@ -75,12 +76,14 @@ class Components:
         matcher: of features.
         create_tracker: makes the tracker of a photo for renders that lie on a device.
         options: settings.
+        index: of views of the map, by the matcher's features; None where there is none.
     """
 
     renderer: Renderer
     matcher: Matcher
     create_tracker: Callable[[Photo, str], Tracker]
     options: LocalizerOptions
+    index: ViewIndex | None = None
 
 
 @dataclass(frozen=True, eq=False)

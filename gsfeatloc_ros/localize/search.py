@@ -1,13 +1,20 @@
-"""Where to look for the photo: at the prior, and round it if the map seen from there has nothing in common with it."""
+"""Where to look for the photo: at the prior, and elsewhere if the map seen from there has nothing in common with it."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import heapq
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from itertools import islice
 
 import numpy as np
 
-from gsfeatloc_ros.common.geometry import make_pose, so3_exp
+from gsfeatloc_ros.common.camera import Camera
+from gsfeatloc_ros.common.geometry import invert, make_pose, so3_exp, transform
+from gsfeatloc_ros.localize.evidence import Evidence
+from gsfeatloc_ros.localize.prior import Prior
 from gsfeatloc_ros.localize.query import MatchedView, Query
+from gsfeatloc_ros.localize.retrieval import Hint, retrieve
 
 # Matches that agree on a pose, by which a view suggests it. Chance makes some agree too: the map is looked at from the
 # pose of a hint that is not strong, and has to confirm it.
@@ -16,12 +23,167 @@ STRONG_HINT = 50
 CONFIRMED_HINT = 12
 # Views are matched with the photo at this width: it is cheap, and what it finds is refined afterwards.
 SEARCH_WIDTH = 320
+# Views nearer to each other than this share of the default deviations of a prior show the same.
+_MIN_VIEW_STEP = 0.3
+# Views are searched in batches of this many; the best of each are followed before the next is looked at.
+_BATCH = 8
+# Fewer matches with a view of the index suggest a pose: the map is rendered there to confirm it.
+_MIN_INDEX_HINT = 6
+# Of what the index suggested, so many are followed once all its views were compared.
+_MAX_FOLLOWED_HINTS = 6
+# Another pose is looked at if so many times as many matches agree with it, in views of so many times as many votes.
+_RIVAL_SHARE = 0.5
+_MAX_RIVALS = 3
+# Poses from which the same points are seen at least so many pixels apart are different places.
+_MIN_DISTANCE_OF_RIVALS = 40.0
 # Of the views that are looked at together, the best of this many are followed.
 _MAX_FOLLOWED_VIEWS = 2
 # Views are chosen from this many random ones for each that is looked at.
 _CANDIDATES_PER_VIEW = 16
 # Nothing is searched farther out than this, in standard deviations of all six coordinates together: 90 % lie within.
 _MAX_DEVIATION = 3.26
+
+
+class Search:
+    """The search for poses of one photo that are worth a closer look.
+
+    Args:
+        small: the photo, at most SEARCH_WIDTH wide.
+        prior: of its pose, None for none.
+        now: clock, in seconds.
+
+    Attributes:
+        best: the view that had most in common with the photo so far; None before one was rendered.
+        views: number of views that were rendered to find the photo.
+        searched: number of the index's views that were compared with it.
+    """
+
+    def __init__(self, small: Query, prior: Prior | None, now: Callable[[], float]) -> None:
+        self._small, self._prior, self._now = small, prior, now
+        self.best: MatchedView | None = None
+        self.views = self.searched = 0
+        self._hints: Iterator[Hint | None] = iter(())
+        self._pending: list[tuple[float, int, Hint]] = []
+        self._followed: Hint | None = None
+
+    def poses(self) -> Iterator[np.ndarray]:
+        """Yield poses (4, 4) of the photo, as long as one is asked for and views are left."""
+        if self._prior is not None:
+            yield from self._look([self._prior.pose])
+        if self._small.components.index is not None:
+            yield from self._indexed()
+        elif self._prior is not None:
+            poses = self._spread(self._prior)
+            for start in range(0, len(poses), _BATCH):
+                yield from self._look(poses[start : start + _BATCH])
+
+    @property
+    def looked(self) -> str:
+        """Where the photo was looked for, in words; empty for nowhere."""
+        views = [] if self._prior is None else ["at the prior"]
+        if self._prior is not None and self.views > 1:
+            views.append(f"in {self.views - 1} views around it")
+        if self.searched:
+            views.append(f"in {self.searched} of {self._index_views} views of the map")
+        return " and ".join(views)
+
+    def counted(self, evidence: Evidence) -> Evidence:
+        """Return evidence with the numbers of views."""
+        views = self.views - (self._prior is not None)
+        return replace(evidence, views=views, searched=self.searched, index_views=self._index_views)
+
+    @property
+    def _index_views(self) -> int:
+        index = self._small.components.index
+        return 0 if index is None else len(index)
+
+    def rivals(self, found: MatchedView) -> Iterator[np.ndarray]:
+        """Yield poses (4, 4), far from the one `found`, which the index suggested nearly as strongly."""
+        if self._followed is None or found.solution is None:
+            return
+        least = _RIVAL_SHARE * self._followed.inliers
+        self._compare(islice(self._hints, max(2 * _BATCH - self.searched, 0)))
+        places = [found.solution.T_map_camera]
+        points, camera = found.found.points[found.solution.inliers], self._small.photo.camera
+        for _, _, hint in sorted(self._pending):
+            if len(places) > _MAX_RIVALS or hint.inliers < max(least, _MIN_INDEX_HINT):
+                continue
+            if any(_offset(camera, points, hint.pose, place) < _MIN_DISTANCE_OF_RIVALS for place in places):
+                continue
+            places.append(hint.pose)
+            pose = self._confirmed(hint.pose)
+            if pose is not None and _offset(camera, points, pose, places[0]) >= _MIN_DISTANCE_OF_RIVALS:
+                yield pose
+
+    def _spread(self, prior: Prior) -> list[np.ndarray]:
+        options = self._small.components.options
+        min_step = _MIN_VIEW_STEP * np.sqrt(options.prior_covariance().diagonal())
+        return spread_poses(prior.pose, prior.covariance, min_step, options.max_views, options.seed)
+
+    def _look(self, poses: Sequence[np.ndarray]) -> Iterator[np.ndarray]:
+        """Render views and yield the poses that the best of them suggest."""
+        looked = look(self._small, poses)
+        self._saw(looked[0], len(looked))
+        for hint in promising(looked):
+            assert hint.solution is not None
+            strong = hint.inliers >= STRONG_HINT
+            pose = hint.solution.T_map_camera if strong else self._confirmed(hint.solution.T_map_camera)
+            if pose is not None:
+                yield pose
+
+    def _indexed(self) -> Iterator[np.ndarray]:
+        """Compare the photo with the index's views and yield the poses that the best of them suggest."""
+        components, prior = self._small.components, self._prior
+        options = components.options.search
+        assert components.index is not None
+        end = self._now() + options.max_seconds
+
+        def likely(pose: np.ndarray) -> bool:
+            return prior is None or prior.deviation(pose) <= _MAX_DEVIATION
+
+        self._hints = islice(retrieve(self._small, components.index, likely), options.max_views)
+        while self._compare(islice(self._hints, _BATCH)) and self._now() < end:
+            yield from self._follow(_MAX_FOLLOWED_VIEWS, MIN_HINT)
+        yield from self._follow(_MAX_FOLLOWED_HINTS, _MIN_INDEX_HINT)
+
+    def _compare(self, hints: Iterator[Hint | None]) -> bool:
+        """Take in what views of the index suggest; return whether there were any."""
+        before = self.searched
+        for hint in hints:
+            self.searched += 1
+            if hint is not None:
+                heapq.heappush(self._pending, (-hint.weight, self.searched, hint))
+        return self.searched > before
+
+    def _follow(self, count: int, min_inliers: int) -> Iterator[np.ndarray]:
+        """Yield the poses of up to `count` of the strongest hints that renders there confirm."""
+        for _ in range(min(count, len(self._pending))):
+            if self._pending[0][2].inliers < min_inliers:
+                return
+            _, _, self._followed = heapq.heappop(self._pending)
+            pose = self._confirmed(self._followed.pose)
+            if pose is not None:
+                yield pose
+
+    def _confirmed(self, pose: np.ndarray) -> np.ndarray | None:
+        """Return the pose (4, 4) of the photo by a render at a suggested one; None where too little agrees."""
+        view = self._small.match(pose)
+        self._saw(view, 1)
+        return view.solution.T_map_camera if view.solution and view.inliers >= CONFIRMED_HINT else None
+
+    def _saw(self, view: MatchedView, count: int) -> None:
+        self.views += count
+        if self.best is None or view.inliers > self.best.inliers:
+            self.best = view
+
+
+def _offset(camera: Camera, points: np.ndarray, a: np.ndarray, b: np.ndarray) -> float:
+    """Return how far apart, in pixels in the median, points (N, 3) are seen from two poses (4, 4)."""
+    here, there = (transform(invert(pose), points) for pose in (a, b))
+    ahead = (here[:, 2] > 0) & (there[:, 2] > 0)
+    if ahead.sum() < 0.5 * len(points):
+        return float("inf")
+    return float(np.median(np.linalg.norm(camera.project(here[ahead]) - camera.project(there[ahead]), axis=1)))
 
 
 def look(query: Query, poses: Sequence[np.ndarray]) -> list[MatchedView]:

@@ -16,6 +16,10 @@ class MapError(ValueError):
     """A map file cannot be used; the message names the file, what is wrong and what to do."""
 
 
+# Gaussians that cover more than this are what is there; others may be haze.
+SOLID_OPACITY = 0.5
+
+
 @dataclass(frozen=True, eq=False)
 class GaussianMap:
     """Gaussians with their parameters activated, ready to be drawn.
@@ -43,7 +47,17 @@ class GaussianMap:
     def __len__(self) -> int:
         return len(self.means)
 
+    def solid_points(self, count: int) -> np.ndarray:
+        """Return the centres (n, 3) float32, splat frame, of up to `count` Gaussians that cover more than a half."""
+        return sample_solid(self.means, self.opacities, count)
+
     @property
     def sh_degree(self) -> int:
         """Degree of the spherical harmonics, 0 to 3."""
         return SH_COEFFICIENTS.index(self.sh.shape[1])
+
+
+def sample_solid(means: np.ndarray, opacities: np.ndarray, count: int) -> np.ndarray:
+    """Return up to `count` of the centres `means` (N, 3) of Gaussians whose `opacities` (N,) are more than a half."""
+    solid = means[opacities > SOLID_OPACITY]
+    return solid[:: -(-len(solid) // count) or 1]

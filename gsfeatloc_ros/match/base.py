@@ -8,7 +8,7 @@ from typing import Protocol, TypeVar
 
 import numpy as np
 
-from gsfeatloc_ros.common.arrays import Array
+from gsfeatloc_ros.common.arrays import Array, to_host
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,6 +27,10 @@ class Features:
 
     def __len__(self) -> int:
         return len(self.keypoints)
+
+    def on_host(self) -> Features:
+        """Return the same with numpy arrays."""
+        return Features(to_host(self.keypoints), to_host(self.descriptors), to_host(self.scores))
 
     @staticmethod
     def none(dimension: int) -> Features:

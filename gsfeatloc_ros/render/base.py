@@ -26,6 +26,9 @@ NEAR_PLANE = 0.01
 # Depth is given where the splats cover at least this much of the pixel.
 DEPTH_MIN_ALPHA = 0.5
 
+# Solid Gaussians of a map of which a renderer knows where they are, for those who look for views of the map.
+_SOLID_POINTS = 20_000
+
 # Opens the block of a stage of a frame by its name, as StageClock.stage does.
 Stage: TypeAlias = Callable[[str], AbstractContextManager[None]]
 
@@ -110,6 +113,11 @@ class Renderer(Protocol):
     @property
     def device(self) -> str: ...
 
+    @property
+    def solid_points(self) -> np.ndarray:
+        """Centres (n, 3) float64, map frame, of a sample of the Gaussians that are solid: what there is to see."""
+        ...
+
     def render(self, camera: Camera, T_map_camera: np.ndarray) -> Render:
         """Draw what `camera` (its distortion ignored) sees from the pose `T_map_camera` (4, 4)."""
         ...
@@ -120,6 +128,10 @@ class Placed(Protocol):
 
     @property
     def S_map_splat(self) -> Similarity: ...
+
+    def solid_points(self, count: int) -> np.ndarray:
+        """Return the centres (n, 3), splat frame, of up to `count` solid Gaussians."""
+        ...
 
 
 def unmeasured(name: str) -> AbstractContextManager[None]:
@@ -137,6 +149,7 @@ class SplatRenderer(ABC):
         self.device = device
         self._map_scale = placed_map.S_map_splat.scale
         self._S_splat_map = placed_map.S_map_splat.inverse()
+        self.solid_points = placed_map.S_map_splat.transform(placed_map.solid_points(_SOLID_POINTS))
 
     def render(self, camera: Camera, T_map_camera: np.ndarray, stage: Stage = unmeasured) -> Render:
         """Draw what `camera` (its distortion ignored) sees from the pose `T_map_camera` (4, 4).

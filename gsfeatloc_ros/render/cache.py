@@ -57,10 +57,7 @@ def load_prepared(
     path = Path(path)
     absolute = Path(os.path.abspath(path))
     cache_path = absolute.with_name(absolute.name + SUFFIX) if cache_path is None else Path(cache_path)
-    try:
-        origin = _origin(absolute)
-    except OSError as error:
-        raise MapError(f"{path}: cannot be read: {error.strerror or error}") from error
+    origin = {"code": _code(), "files": [_identity(file) for file in _map_files(absolute)]}
     prepared = _read_if_usable(cache_path, origin)
     if prepared is None:
         prepared = prepare(load_map(path))
@@ -140,22 +137,43 @@ def _checksum(header: bytes, arrays: dict[str, np.ndarray]) -> int:
     return checksum
 
 
-def _origin(path: Path) -> dict[str, Any]:
-    """Return what a cache is made from: the code that reads and prepares maps, and the files of the map."""
+def map_content(path: str | Path) -> list[Any]:
+    """Return what tells the content of a map from that of others: size and a hash of a sample of each of its files.
+
+    It is the same for a copy under another name.
+
+    Raises:
+        MapError: the map cannot be read.
+    """
+    return [[identity[1], identity[3]] for identity in map(_identity, _map_files(Path(os.path.abspath(path))))]
+
+
+def _map_files(path: Path) -> list[Path]:
+    """Return the files that a map consists of; raise MapError where they cannot be listed."""
     folder = path if path.is_dir() else path.parent if path.suffix == ".json" else None
-    files = [path] if folder is None else sorted(file for file in folder.iterdir() if file.suffix in _SOG_SUFFIXES)
-    return {"code": _code(), "files": [_identity(file) for file in files if file.is_file()]}
+    try:
+        files = [path] if folder is None else sorted(file for file in folder.iterdir() if file.suffix in _SOG_SUFFIXES)
+    except OSError as error:
+        raise MapError(f"{path}: cannot be read: {error.strerror or error}") from error
+    return [file for file in files if file.is_file()]
 
 
 def _identity(file: Path) -> list[Any]:
-    """Return name, size in bytes, time of the last change and a hash of a sample of the content."""
-    status = file.stat()
-    last = max(status.st_size - _SAMPLE_BYTES, 0)
+    """Return name, size in bytes, time of the last change and a hash of a sample of the content.
+
+    Raises:
+        MapError: the file cannot be read.
+    """
     digest = hashlib.sha256()
-    with file.open("rb") as stream:
-        for sample in range(_SAMPLES):
-            stream.seek(last * sample // (_SAMPLES - 1))
-            digest.update(stream.read(_SAMPLE_BYTES))
+    try:
+        status = file.stat()
+        last = max(status.st_size - _SAMPLE_BYTES, 0)
+        with file.open("rb") as stream:
+            for sample in range(_SAMPLES):
+                stream.seek(last * sample // (_SAMPLES - 1))
+                digest.update(stream.read(_SAMPLE_BYTES))
+    except OSError as error:
+        raise MapError(f"{file}: cannot be read: {error.strerror or error}") from error
     return [file.name, status.st_size, status.st_mtime_ns, digest.hexdigest()]
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from gsfeatloc_ros.maps.gaussian_map import SH_COEFFICIENTS, GaussianMap
+from gsfeatloc_ros.maps.gaussian_map import SH_COEFFICIENTS, GaussianMap, sample_solid
 from gsfeatloc_ros.maps.similarity import Similarity
 from gsfeatloc_ros.render.base import MIN_ALPHA
 from gsfeatloc_ros.render.kernels import njit, prange
@@ -55,6 +55,11 @@ class PreparedMap:
     def sh_coefficients(self) -> int:
         """Number of spherical harmonics per colour channel that are stored."""
         return self.sh.shape[1] // 3
+
+    def solid_points(self, count: int) -> np.ndarray:
+        """Return the centres (n, 3) float32, splat frame, of up to `count` Gaussians that cover more than a half."""
+        means = self.gaussians[:, MEAN_X : MEAN_Z + 1].transpose(0, 2, 1).reshape(-1, 3)
+        return sample_solid(means, np.exp2(self.gaussians[:, LOG2_OPACITY].ravel()), count)
 
     def unpacked(self, sh_degree: int) -> UnpackedGaussians:
         """Return the Gaussians one by one, in their order, with harmonics up to a degree or as many as there are."""

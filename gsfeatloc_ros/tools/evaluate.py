@@ -26,9 +26,9 @@ from gsfeatloc_ros.evaluate.ablation import ABLATIONS
 from gsfeatloc_ros.evaluate.corruptions import CORRUPTIONS
 from gsfeatloc_ros.evaluate.degradations import DEGRADATIONS
 from gsfeatloc_ros.evaluate.plan import Combinations, Evaluation
-from gsfeatloc_ros.evaluate.protocol import PROTOCOLS
+from gsfeatloc_ros.evaluate.protocol import PROTOCOLS, WITHOUT_PRIOR
 from gsfeatloc_ros.evaluate.record import Record
-from gsfeatloc_ros.evaluate.run import METHODS, PRIORS_FILE
+from gsfeatloc_ros.evaluate.run import INDICES, METHODS, PRIORS_FILE
 from gsfeatloc_ros.evaluate.suites import SUITES, Condition
 from gsfeatloc_ros.evaluate.tables import RunResults, describe, over_seeds, query_table, run_summary, run_table
 from gsfeatloc_ros.evaluate.trust import describe_trust, trust_table
@@ -115,6 +115,7 @@ def _combinations(options: argparse.Namespace) -> Combinations:
         seeds=options.seed,
         max_width=options.max_width,
         options=options.set,
+        index=options.index,
         ablations=[name.replace(_NOTHING, "") for name in options.ablation],
     )
 
@@ -205,6 +206,12 @@ def _parser() -> argparse.ArgumentParser:
         "--suite",
         choices=SUITES,
         help="trust: right photos, all corruptions, degraded maps, and photos that are not of the scene",
+    )
+    parser.add_argument(
+        "--index",
+        choices=INDICES,
+        help="where to look for what the prior does not show: views of the map alone, or of the training poses as well "
+        f"(default: map for {' and '.join(WITHOUT_PRIOR)}, else none)",
     )
     parser.add_argument("--limit", type=number(int, 0), default=0, help="only the first photos; 0 for all")
     parser.add_argument(

@@ -1,0 +1,7 @@
+"""An index of views of the map: where a photo without any prior may have been taken."""
+
+from gsfeatloc_ros.index.build import build_index
+from gsfeatloc_ros.index.options import IndexOptions
+from gsfeatloc_ros.index.view_index import ViewIndex
+
+__all__ = ["IndexOptions", "ViewIndex", "build_index"]

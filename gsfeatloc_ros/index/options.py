@@ -1,0 +1,20 @@
+"""Settings of a view index."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from gsfeatloc_ros.common.parameter import parameter
+
+
+@dataclass(frozen=True)
+class IndexOptions:
+    """Settings of a view index; the node has them as parameters `index.*`."""
+
+    build: bool = parameter(True, "Make the index of views, which finds images without a prior, where there is none.")
+    path: str = parameter(
+        "",
+        "Path of the index of views; empty for a file beside the map (*.gsfeatloc-index) or in the user's cache.",
+    )
+    views: int = parameter(240, "Number of views in an index that is made.", (1, 100_000))
+    seed: int = parameter(0, "Seed of the places of the views.", (0, 2**31 - 1))

@@ -1,0 +1,146 @@
+"""Where to look at a map from: poses from which solid Gaussians are seen, few of which show the same."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Sequence
+
+import numpy as np
+
+from gsfeatloc_ros.common.arrays import to_host
+from gsfeatloc_ros.common.camera import Camera
+from gsfeatloc_ros.common.geometry import make_pose
+from gsfeatloc_ros.render.base import Render
+
+# Positions are drawn from the box of the solid Gaussians, but for a share of outliers at each end, grown by so much,
+# and from these distances from them, in radii of the box.
+_OUTLIERS = 1.0  # per cent
+_GROWTH = 0.25
+_DISTANCES = (0.1, 2.0)
+# Views that show so little, or of which so much is too near, are of no use.
+_MIN_SEEN = 0.2
+_MAX_NEAR = 0.05
+# A pixel shows a surface where it is covered so far and its depths spread over no more than this share of the depth.
+_MIN_ALPHA = 0.9
+_MAX_SPREAD = 0.15
+# Of a view's pixels every so many across and down are looked at.
+_PIXEL_STEP = 4
+# What is seen is counted in cells of this share of its distance, rounded to a power of two, and by the direction from
+# which it is seen, one of so many: features look the same only from near where they were seen.
+CELL = 0.25
+_DIRECTIONS = 12
+
+
+def random_poses(points: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
+    """Draw poses (count, 4, 4), T_map_camera, each aimed at one of the points (N, 3).
+
+    Half of them lie anywhere in the box of the points, as cameras in rooms do; half at any distance from what they look
+    at, as those round an object do.
+
+    Raises:
+        ValueError: there is no point.
+    """
+    if len(points) == 0:
+        raise ValueError("nothing in the map is solid: no Gaussian covers more than a half")
+    low, high = _box(points)
+    margin = 0.5 * _GROWTH * (high - low)
+    targets = points[rng.integers(len(points), size=count)]
+    inside = rng.uniform(low - margin, high + margin, (count, 3))
+    away = rng.normal(size=(count, 3))
+    away /= np.linalg.norm(away, axis=1, keepdims=True)
+    distances = radius(points) * np.exp(rng.uniform(np.log(_DISTANCES[0]), np.log(_DISTANCES[1]), (count, 1)))
+    positions = np.where(rng.random((count, 1)) < 0.5, inside, targets + distances * away)
+    return np.array([_aimed(*pair, rng) for pair in zip(positions, targets, strict=True)])
+
+
+def radius(points: np.ndarray) -> float:
+    """Return half of the diagonal of the box of points (N, 3), but for outliers."""
+    low, high = _box(points)
+    return 0.5 * float(np.linalg.norm(high - low))
+
+
+def seen_cells(render: Render, camera: Camera, T_map_camera: np.ndarray, near: float) -> set[int]:
+    """Return what a view shows, as cells; none where it is of no use.
+
+    Args:
+        render: of the view.
+        camera: of the view.
+        T_map_camera: (4, 4) its pose.
+        near: distance within which hardly anything may be.
+    """
+    rows, columns = (axis.ravel() for axis in np.mgrid[2 : camera.height : _PIXEL_STEP, 2 : camera.width : _PIXEL_STEP])
+    depth, spread, alpha = (
+        to_host(picture)[rows, columns].astype(np.float64)
+        for picture in (render.median_depth, render.depth_std, render.alpha)
+    )
+    surface = (alpha > _MIN_ALPHA) & (spread < _MAX_SPREAD * depth)
+    if surface.mean() < _MIN_SEEN or np.mean(depth < near) > _MAX_NEAR:
+        return set()
+    rays = camera.rays(np.column_stack([columns, rows]).astype(np.float64)[surface])
+    points = (rays * depth[surface, None]) @ T_map_camera[:3, :3].T + T_map_camera[:3, 3]
+    return cells(points, T_map_camera[:3, 3], CELL)
+
+
+def cells(points: np.ndarray, centre: np.ndarray, size: float) -> set[int]:
+    """Return the cells, numbered by a hash, of points (N, 3) seen from a `centre` (3,).
+
+    Args:
+        points: (N, 3) map frame.
+        centre: (3,) of the camera.
+        size: of the cells, as a share of the distance.
+    """
+    offsets = points - centre
+    distances = np.linalg.norm(offsets, axis=1)
+    octaves = np.round(np.log2(np.maximum(distances, np.finfo(float).tiny)))
+    grid = np.floor(points / (size * 2.0**octaves)[:, None])
+    directions = (offsets @ _sphere(_DIRECTIONS).T).argmax(axis=1)
+    keys = np.column_stack([octaves, grid, directions]).astype(np.int64)
+    return {hash(key.tobytes()) for key in keys}
+
+
+def cover(seen: Sequence[set[int]], count: int, first: int = 0) -> list[int]:
+    """Choose up to `count` of the views that show most cells together, by the greedy algorithm.
+
+    By Nemhauser et al. (1978) it is no farther than a factor of 1 - 1/e from the best choice.
+
+    Args:
+        seen: the cells of each view.
+        count: most views.
+        first: so many of the views, from the first on, are chosen from before the others.
+    """
+    chosen: list[int] = []
+    covered: set[int] = set()
+    for part in (range(first), range(first, len(seen))):
+        # Gains only shrink: one that is still the largest after it was counted anew is the largest of all.
+        gains = [(-len(seen[view]), view) for view in part]
+        heapq.heapify(gains)
+        while gains and len(chosen) < count:
+            _, view = heapq.heappop(gains)
+            gain = len(seen[view] - covered)
+            if gains and gain < -gains[0][0]:
+                heapq.heappush(gains, (-gain, view))
+            elif gain > 0:
+                chosen.append(view)
+                covered |= seen[view]
+    return chosen
+
+
+def _box(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    low, high = np.percentile(points, [_OUTLIERS, 100 - _OUTLIERS], axis=0)
+    return low, high
+
+
+def _aimed(position: np.ndarray, target: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Return the pose (4, 4) of a camera at `position` (3,) that looks at `target` (3,), rolled by any angle."""
+    z = target - position
+    z = z / np.linalg.norm(z) if z.any() else np.array([0.0, 0.0, 1.0])
+    x = np.cross(z, rng.normal(size=3))
+    x /= np.linalg.norm(x)
+    return make_pose(np.column_stack([x, np.cross(z, x), z]), position)
+
+
+def _sphere(count: int) -> np.ndarray:
+    """Return `count` directions (count, 3) spread over the sphere (a Fibonacci lattice)."""
+    z = 1 - (2 * np.arange(count) + 1) / count
+    angle = np.pi * (1 + 5**0.5) * np.arange(count)
+    return np.column_stack([np.sqrt(1 - z * z) * np.cos(angle), np.sqrt(1 - z * z) * np.sin(angle), z])

@@ -1,0 +1,147 @@
+"""Views of a map with their features and what these are features of, compressed, to be searched."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from gsfeatloc_ros.match.base import Features, Matches
+from gsfeatloc_ros.match.nearest import match_mutual
+
+# Bytes of a compressed descriptor (product quantization; Jegou et al., 2011), and the values of each.
+CODE_BYTES = 32
+_VALUES = 256
+# Lists that descriptors are kept in, about the square root of their number, and how many of them are searched.
+_MAX_LISTS = 4096
+_SEARCHED_LISTS = 12
+# A feature votes for the views of this many of its nearest.
+_VOTES = 8
+# Lowe's ratio in the matching with a view's few features.
+_MAX_DISTANCE_RATIO = 0.9
+# Steps of a point's coordinate over the box of all points.
+_STEPS = 65535
+
+
+@dataclass(frozen=True, eq=False)
+class ViewIndex:
+    """Views of a map.
+
+    Attributes:
+        poses: (N, 4, 4) float64, T_map_camera.
+        counts: (N,) int32, number of features of each view; these follow each other in the arrays below.
+        points: (M, 3) uint16, the points of the map under the features, from `low` to `high`.
+        codes: (M, CODE_BYTES) uint8, the features' descriptors, compressed.
+        centroids: (CODE_BYTES, 256, D / CODE_BYTES) float32, what the bytes of a code stand for.
+        low, high: (3,) float64, box of the points, map frame.
+    """
+
+    poses: np.ndarray
+    counts: np.ndarray
+    points: np.ndarray
+    codes: np.ndarray
+    centroids: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.poses)
+
+    def rank(self, features: Features) -> np.ndarray:
+        """Return the number of features of a photo (N,) float64 that speak for each view.
+
+        A feature has a vote for each view that holds one of those nearest to it.
+        """
+        if len(self.codes) == 0 or len(features) == 0:
+            return np.zeros(len(self))
+        _, nearest = self._search.search(features.descriptors, min(_VOTES, len(self.codes)))
+        views = np.where(nearest >= 0, self._view_of[nearest], len(self))
+        # One vote a view, of how many of its features ever: repetitive texture must not outvote the rest.
+        votes = np.unique(np.column_stack([np.repeat(np.arange(len(views)), views.shape[1]), views.ravel()]), axis=0)
+        return np.bincount(votes[:, 1], minlength=len(self) + 1)[: len(self)].astype(np.float64)
+
+    def match(self, features: Features, view: int) -> tuple[Matches, np.ndarray]:
+        """Match a photo's features with a view's; return the matches, and the points (M, 3) of the map at them.
+
+        `b` of the matches is of no meaning: where in the view its features lie is not kept.
+        """
+        kept = slice(self._first[view], self._first[view + 1])
+        numbers = np.arange(kept.stop - kept.start, dtype=np.float32)
+        descriptors = self._decoded(self.codes[kept])
+        there = Features(np.column_stack([numbers, numbers]), descriptors, np.ones(len(numbers), np.float32))
+        matches = match_mutual(features, there, max_ratio=_MAX_DISTANCE_RATIO)
+        points = self.points[kept][matches.b[:, 0].astype(int)]
+        return matches, self.low + points / _STEPS * (self.high - self.low)
+
+    @staticmethod
+    def compress(poses: np.ndarray, descriptors: list[np.ndarray], points: list[np.ndarray]) -> ViewIndex:
+        """Make an index of views.
+
+        Args:
+            poses: (N, 4, 4) T_map_camera.
+            descriptors: (m, D) float32 unit length of each view's features.
+            points: (m, 3) of each view's features, map frame.
+
+        Raises:
+            ValueError: there is no feature, or D is no multiple of CODE_BYTES.
+        """
+        import faiss
+
+        every, where = np.concatenate(descriptors), np.concatenate(points)
+        if len(every) == 0:
+            raise ValueError("the map shows nothing that could be recognized: no view of it has features")
+        quantizer = faiss.ProductQuantizer(every.shape[1], CODE_BYTES, round(math.log2(_VALUES)))
+        # Fewer than its values it would refuse to train on.
+        quantizer.train(np.resize(every, (max(len(every), _VALUES), every.shape[1])))
+        low, high = where.min(axis=0), where.max(axis=0)
+        steps = np.round((where - low) / np.maximum(high - low, np.finfo(float).tiny) * _STEPS)
+        return ViewIndex(
+            poses=np.asarray(poses, np.float64),
+            counts=np.array([len(view) for view in points], np.int32),
+            points=steps.astype(np.uint16),
+            codes=quantizer.compute_codes(every),
+            centroids=faiss.vector_to_array(quantizer.centroids).reshape(CODE_BYTES, _VALUES, -1),
+            low=low,
+            high=high,
+        )
+
+    @cached_property
+    def _first(self) -> np.ndarray:
+        return np.concatenate([[0], np.cumsum(self.counts, dtype=np.int64)])
+
+    @cached_property
+    def _view_of(self) -> np.ndarray:
+        return np.repeat(np.arange(len(self)), self.counts)
+
+    def _decoded(self, codes: np.ndarray) -> np.ndarray:
+        """Return the descriptors (m, D) float32 of codes (m, CODE_BYTES), of unit length."""
+        descriptors = self.centroids[np.arange(CODE_BYTES), codes].reshape(len(codes), -1)
+        return descriptors / np.maximum(np.linalg.norm(descriptors, axis=1, keepdims=True), 1e-9)
+
+    @cached_property
+    def _search(self) -> Any:
+        """The descriptors in faiss's inverted lists, which need not all be looked at."""
+        import faiss
+
+        dimension = self.centroids.shape[0] * self.centroids.shape[2]
+        lists = int(np.clip(math.sqrt(len(self.codes)), 1, _MAX_LISTS))
+        coarse = faiss.IndexFlatL2(dimension)
+        search = faiss.IndexIVFPQ(coarse, dimension, lists, CODE_BYTES, round(math.log2(_VALUES)))
+        search.by_residual = False
+        faiss.copy_array_to_vector(self.centroids.ravel(), search.pq.centroids)
+        sample = self._decoded(self.codes[:: -(-len(self.codes) // (64 * lists))])
+        clustering = faiss.Clustering(dimension, lists)
+        clustering.min_points_per_centroid, clustering.niter = 1, 8
+        clustering.train(sample, coarse)
+        search.is_trained = True
+        search.nprobe = _SEARCHED_LISTS
+        for start in range(0, len(self.codes), _BATCH):
+            search.add(self._decoded(self.codes[start : start + _BATCH]))
+        return search
+
+
+# Descriptors that are decoded together.
+_BATCH = 100_000
