@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -75,6 +76,20 @@ class ViewIndex:
         matches = match_mutual(features, there, max_ratio=_MAX_DISTANCE_RATIO)
         points = self.points[kept][matches.b[:, 0].astype(int)]
         return matches, self.low + points / _STEPS * (self.high - self.low)
+
+    @cached_property
+    def centres(self) -> np.ndarray:
+        """What the views look at: the medians (N, 3) of their points, map frame; of a view without any its place."""
+        steps = [
+            np.median(self.points[start:end], axis=0) if end > start else None
+            for start, end in pairwise(self._first.tolist())
+        ]
+        return np.array(
+            [
+                pose[:3, 3] if step is None else self.low + step / _STEPS * (self.high - self.low)
+                for pose, step in zip(self.poses, steps, strict=True)
+            ]
+        ).reshape(-1, 3)
 
     @staticmethod
     def compress(poses: np.ndarray, descriptors: list[np.ndarray], points: list[np.ndarray]) -> ViewIndex:
