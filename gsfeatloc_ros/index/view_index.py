@@ -108,8 +108,11 @@ class ViewIndex:
         every, where = np.concatenate(descriptors), np.concatenate(points)
         if len(every) == 0:
             raise ValueError("the map shows nothing that could be recognized: no view of it has features")
+        if every.shape[1] % CODE_BYTES:
+            raise ValueError(f"descriptors of {every.shape[1]} numbers are no multiple of {CODE_BYTES}")
         quantizer = faiss.ProductQuantizer(every.shape[1], CODE_BYTES, round(math.log2(_VALUES)))
-        # Fewer than its values it would refuse to train on.
+        # It warns of few on standard error; and fewer than its values it would refuse to train on.
+        quantizer.cp.min_points_per_centroid = 1
         quantizer.train(np.resize(every, (max(len(every), _VALUES), every.shape[1])))
         low, high = where.min(axis=0), where.max(axis=0)
         steps = np.round((where - low) / np.maximum(high - low, np.finfo(float).tiny) * _STEPS)
