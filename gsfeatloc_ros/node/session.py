@@ -59,6 +59,7 @@ class Session:
             f"no camera_info yet: publish sensor_msgs/CameraInfo on {node.resolve_topic_name('camera_info')}",
             f"no prior yet: publish geometry_msgs/PoseStamped on {node.resolve_topic_name('prior')}",
         )
+        self._inputs.line_delay = settings.image.line_delay
         self.attempts = Attempts(engine, self._inputs, self._publishers, self._report, settings.node.track)
         self.reception = Reception(node, settings, self._inputs, self._report, self.attempts.offer)
         # On a clock of its own: that of a simulation may stand still.
@@ -112,6 +113,7 @@ class Session:
         """Go on with other settings, but for those that are read when the node is configured."""
         self.settings = settings
         self._inputs.policy = settings.prior_policy()
+        self._inputs.line_delay = settings.image.line_delay
         self.reception.use_settings(settings)
         self.attempts.use_options(settings.localizer)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from threading import Lock
 from typing import Any, Generic, TypeVar
@@ -42,7 +42,7 @@ class LocalizerInput:
 
     Attributes:
         image: (H, W, 3) uint8 RGB.
-        camera: of the image.
+        camera: of the image, with its motion while the rows were read, where that is known.
         T_map_camera_prior: (4, 4).
         prior_covariance: (6, 6) in ROS order about the map's axes, or None where it is not known.
         prior: what the two were made of.
@@ -79,14 +79,19 @@ class Inputs:
     be taken in one thread and images asked for in another.
 
     Args:
-        policy: what priors are worth; may be replaced later.
+        policy: what priors are worth.
         lookup: of the robot's frames.
         rectified: whether images are.
         no_camera, no_prior: what to say while there is none.
+
+    Attributes:
+        policy: what priors are worth; may be replaced later.
+        line_delay: seconds from a row of images to the next; 0 for a global shutter. May be replaced later.
     """
 
     def __init__(self, policy: PriorPolicy, lookup: Lookup, rectified: bool, no_camera: str, no_prior: str) -> None:
         self.policy = policy
+        self.line_delay = 0.0
         self._lookup = lookup
         self._rectified = rectified
         self._no_prior = no_prior
@@ -176,7 +181,9 @@ class Inputs:
                 f"camera_info is for {camera.width}x{camera.height} but the image is {width}x{height}: use the "
                 "camera_info of this image"
             )
-        pose, covariance = self._at(prior, nanoseconds(message.header.stamp), message.header.frame_id)
+        stamp, frame = nanoseconds(message.header.stamp), message.header.frame_id
+        pose, covariance = self._at(prior, stamp, frame)
+        camera = replace(camera, readout=self._readout(stamp, frame, height))
         return LocalizerInput(decode_picture(message), camera, pose, covariance, prior)
 
     def _set_prior(self, newest: _Newest[Prior]) -> None:
@@ -192,6 +199,16 @@ class Inputs:
             self._odometry = self._no_odometry()
             self._odometry_frame = message.child_frame_id
         self._odometry.add(nanoseconds(message.header.stamp), pose)
+
+    def _readout(self, stamp: int, camera_frame: str, rows: int) -> np.ndarray | None:
+        """Return how the camera moved (6,) while it read the rows of an image; None where that is not known."""
+        velocity = self._odometry.velocity(stamp) if stamp and self.line_delay else None
+        if velocity is None:
+            return None
+        T_body_camera = self._lookup(self._odometry_frame, camera_frame, stamp)
+        linear, angular = velocity[:3] + np.cross(velocity[3:], T_body_camera[:3, 3]), velocity[3:]
+        in_camera = np.concatenate([linear @ T_body_camera[:3, :3], angular @ T_body_camera[:3, :3]])
+        return rows * self.line_delay * in_camera
 
     def _at(self, prior: Prior, stamp: int, camera_frame: str) -> tuple[np.ndarray, np.ndarray | None]:
         """Return the pose (4, 4) and covariance (6, 6) of the camera in the map frame at `stamp` by a prior."""
