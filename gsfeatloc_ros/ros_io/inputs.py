@@ -190,8 +190,10 @@ class Inputs:
         if prior is None or not prior.source.own or not prior.stamp or newest is None:
             return None
         travelled = self._odometry.travelled(prior.stamp, newest)
-        return None if travelled is None else position_sigma(
-            self._grown(prior.covariance, self.policy.growth.by_odometry(travelled))
+        return (
+            None
+            if travelled is None
+            else position_sigma(self._grown(prior.covariance, self.policy.growth.by_odometry(travelled)))
         )
 
     def for_image(self, message: AnyImage, camera: Camera | None = None, prior: Prior | None = None) -> LocalizerInput:

@@ -14,6 +14,7 @@ class OutcomeStatus(Enum):
     LOCALIZED = "localized"
     REJECTED = "rejected"
     FAILED = "failed"
+    AMBIGUOUS = "ambiguous"
     UNCONFIRMED = "unconfirmed"
     REFUSED = "refused"
     ERROR = "error"
@@ -24,7 +25,8 @@ class Outcome:
     """What came of an image.
 
     Attributes:
-        status: UNCONFIRMED: a pose was found that another image has to confirm. REFUSED: the image could not be tried. ERROR: a bug met on it, or no memory. Otherwise the estimate's.
+        status: UNCONFIRMED: a pose was found that another image has to confirm. REFUSED: the image could not be tried.
+            ERROR: a bug met on it, or no memory. Otherwise the estimate's.
         reason: one sentence.
         estimate: None if the image could not be tried.
     """

@@ -74,7 +74,7 @@ class PriorPolicy:
         return Prior(PriorSource.PLANE, 0, self.map_frame, True, np.eye(4), np.diag(variances))
 
     def saved(self, T_map_camera: np.ndarray, sigma: float) -> Prior:
-        """Return the prior that a pose (4, 4) of a run before is: the robot may be as far away as `sigma`, map units."""
+        """Return the prior that a pose (4, 4) of a run before is; the robot may be `sigma` map units away from it."""
         variances = np.square([sigma] * 3 + [_SAVED_ROTATION] * 3)
         return Prior(PriorSource.SAVED, 0, self.map_frame, False, T_map_camera, np.diag(variances))
 

@@ -51,7 +51,7 @@ class StateOptions:
         live=True,
     )
     coast_after: float = parameter(
-        1.0, "Seconds without an answer after which the state is COASTING.", (0.0, 1e6), live=True
+        2.0, "Seconds without an answer after which the state is COASTING.", (0.0, 1e6), live=True
     )
     lost_after: float = parameter(
         15.0, "Seconds of images without an answer after which the state is LOST.", (0.0, 1e6), live=True
@@ -221,7 +221,8 @@ class LocalizationState:
         """Return in words how the answer jumps away from where the last one was carried; empty where it does not."""
         if attempt.source is not PriorSource.LAST_ANSWER or _apart(attempt) <= _MAX_STEADY:
             return ""
-        assert attempt.T_map_camera_prior is not None and attempt.T_map_camera is not None  # it is a number
+        assert attempt.T_map_camera_prior is not None  # otherwise nothing is apart
+        assert attempt.T_map_camera is not None
         distance = translation_error(attempt.T_map_camera_prior, attempt.T_map_camera)
         angle = rotation_error_deg(attempt.T_map_camera_prior, attempt.T_map_camera)
         return f"the pose jumps by {distance:.2f} and {angle:.0f} degrees"

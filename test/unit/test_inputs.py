@@ -175,7 +175,7 @@ def test_an_image_of_another_size_than_the_camera():
 def test_a_prior_of_the_future_is_refused():
     made = inputs()
     made.take(InputTopic.PRIOR, prior(100, np.eye(4)))
-    with pytest.raises(ValueError, match=r"prior is 10\.5 s newer than the image .* prior_max_age.*: do the clocks .* agree"):
+    with pytest.raises(ValueError, match=r"prior is 10\.5 s newer than the image .*prior_max_age.*: do the clocks"):
         made.for_image(image(89.5))
     np.testing.assert_array_equal(asked(made, 90.1), np.eye(4))
 

@@ -154,7 +154,7 @@ def test_time_alone_coasts_and_loses_where_images_ought_to_come():
     for wanted, expected in ((True, State.LOST), (False, State.COASTING)):
         robot = Robot()
         robot.answer(PriorSource.PRIOR)
-        robot.wait(2.0)
+        robot.wait(2.1)
         robot.state.pass_time(None, wanted)
         assert robot.now is State.COASTING
         robot.wait(20.0)
