@@ -11,6 +11,8 @@ from gsfeatloc_ros.localize.evidence import Limits
 from gsfeatloc_ros.pose.lift import LiftOptions
 from gsfeatloc_ros.pose.solve import PoseOptions
 
+MAX_SEED = 2**31 - 1
+
 
 @dataclass(frozen=True)
 class SearchOptions:
@@ -40,7 +42,7 @@ class LocalizerOptions:
         0.5, "Standard deviation of the prior in map units along each axis.", (1e-6, 1e6), live=True
     )
     seed: int = parameter(
-        0, "Seed of RANSAC and of the search: the same seed gives the same answer.", (0, 2**31 - 1), live=True
+        0, "Seed of RANSAC and of the search: the same seed gives the same answer.", (0, MAX_SEED), live=True
     )
     search: SearchOptions = field(default_factory=SearchOptions)
     pose: PoseOptions = field(default_factory=PoseOptions)
