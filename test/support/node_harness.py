@@ -62,6 +62,10 @@ class NodeProcess(process.LocalizerProcess):
     def wait_for_output(self, pattern: str, timeout: float = TIMEOUT) -> None:
         super().wait_for_output(pattern, timeout)
 
+    def wait_for_index(self) -> None:
+        """Wait until it finds images without a prior."""
+        super().wait_for_output("the view index is ready", process.START_TIMEOUT)
+
     def wait(self, timeout: float = TIMEOUT) -> int:
         return super().wait(timeout)
 
