@@ -5,10 +5,11 @@ from __future__ import annotations
 import threading
 import time
 
-from gsfeatloc_ros.index import IndexOptions, index_for
 from gsfeatloc_ros.localize.engine import Engine
+from gsfeatloc_ros.localize.map_index import index_for, index_key
 from gsfeatloc_ros.node.attempts import Attempts
-from gsfeatloc_ros.node.diagnostics import ERROR, OK, Reporter
+from gsfeatloc_ros.node.diagnostics import ERROR, OK, WARN, Reporter
+from gsfeatloc_ros.node.settings import Settings
 
 # Seconds between two words on how far it is.
 _PROGRESS_PERIOD = 2.0
@@ -18,21 +19,24 @@ class IndexBuild:
     """Gives attempts the view index of their map, in a thread of its own, while they go on without.
 
     Args:
-        options: of the index.
         attempts: that are to use it.
         reporter: writes to the log and to /diagnostics.
     """
 
-    def __init__(self, options: IndexOptions, attempts: Attempts, reporter: Reporter) -> None:
-        self._options, self._attempts, self._reporter = options, attempts, reporter
+    def __init__(self, attempts: Attempts, reporter: Reporter) -> None:
+        self._attempts, self._reporter = attempts, reporter
         self._cancelled = threading.Event()
         self._thread: threading.Thread | None = None
 
-    def start(self) -> None:
-        """Load or build the index of the map that is in use now; one that is being built for another is given up."""
+    def start(self, settings: Settings) -> None:
+        """Load or build the index of the map that is in use now; one that is being built for another is given up.
+
+        Args:
+            settings: of the node, and of that map.
+        """
         self._cancelled.set()
         self._cancelled = threading.Event()
-        arguments = (self._attempts.engine, self._cancelled)
+        arguments = (settings, self._attempts.engine, self._cancelled)
         self._thread = threading.Thread(target=self._run, args=arguments, name="indexer", daemon=True)
         self._thread.start()
 
@@ -46,7 +50,7 @@ class IndexBuild:
 
     # In a thread of its own.
 
-    def _run(self, engine: Engine, cancelled: threading.Event) -> None:
+    def _run(self, settings: Settings, engine: Engine, cancelled: threading.Event) -> None:
         start, said = time.monotonic(), time.monotonic()
 
         def progress(done: int, total: int) -> None:
@@ -56,14 +60,17 @@ class IndexBuild:
                 self._say(OK, f"building the view index: {done} of {total} views", engine, done)
 
         try:
-            index = index_for(engine, self._options, progress, cancelled.is_set)
+            key = index_key(engine.map_path, settings.map, settings.matcher)
+            index = index_for(engine, settings.index, key, progress, cancelled.is_set)
         except Exception as error:  # whatever it is, the node serves on
             if not cancelled.is_set():
                 reason = f"no view index, without a prior nothing is found: {error}"
                 self._reporter.error(reason)
                 self._say(ERROR, reason, engine, 0, log=False)
             return
-        if not cancelled.is_set():
+        if index is None:
+            self._say(WARN, "there is no view index, and index.build is false: images need a prior", engine, 0)
+        elif not cancelled.is_set():
             self._attempts.use_index(engine, index)
             seconds = time.monotonic() - start
             self._say(OK, f"the view index is ready: {len(index)} views, {seconds:.1f} s", engine, len(index))

@@ -74,8 +74,8 @@ class Session:
         outputs = Outputs(self._publishers, self._standing, self._pose_file, self._report)
         self.attempts = Attempts(engine, self._follower, outputs)
         self.reception = Reception(node, settings, inputs, self._report, self.attempts.offer)
-        self._index_build = IndexBuild(settings.index, self.attempts, reporter)
-        self._index_build.start()
+        self._index_build = IndexBuild(self.attempts, reporter)
+        self._index_build.start(settings)
         # On a clock of its own: that of a simulation may stand still.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._timers = [
@@ -140,7 +140,7 @@ class Session:
         self._publishers.forget()
         self._standing.publish()
         self._pose_file.use_map(self.settings.map)
-        self._index_build.start()
+        self._index_build.start(self.settings)
 
     def use_settings(self, settings: Settings) -> None:
         """Go on with other settings, but for those that are read when the node is configured."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from gsfeatloc_ros.common.parameter import Value, parameter, parameters_of, settings_from
+from gsfeatloc_ros.common.parameter import Parameter, Value, parameter, parameters_of, settings_from
 from gsfeatloc_ros.index import IndexOptions
 from gsfeatloc_ros.localize.options import LocalizerOptions
 from gsfeatloc_ros.localize.settings import MapSettings, MatcherSettings, RendererSettings
@@ -164,4 +164,14 @@ _GROUPS = {
     "state.": StateSettings,
     "index.": IndexOptions,
 }
-PARAMETERS = tuple(item for prefix, group in _GROUPS.items() for item in parameters_of(group, prefix))
+_PREFIXES = list(_GROUPS)
+
+
+def _place(parameter: Parameter) -> int:
+    """Return the place of a parameter's group among the others."""
+    return _PREFIXES.index(parameter.name[: parameter.name.rfind(".") + 1])
+
+
+PARAMETERS = tuple(
+    sorted((item for prefix, group in _GROUPS.items() for item in parameters_of(group, prefix)), key=_place)
+)

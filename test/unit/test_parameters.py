@@ -116,11 +116,13 @@ def test_what_is_no_parameter_does_not_count():
 def test_options_of_the_localizer_are_parameters_but_for_those_of_experts():
     options = LocalizerOptions()
     nested = [getattr(options, name) for name in ("pose", "limits", "lift")]
-    names = {item.name for settings in (options, *nested) for item in fields(settings)} - {"pose", "limits", "lift"}
+    groups = {"pose", "limits", "lift", "search"}
+    names = {item.name for settings in (options, *nested) for item in fields(settings)} - groups
     parameters = {name.removeprefix("localizer.") for name in DEFAULTS if name.startswith("localizer.")}
     experts = {"cauchy_scale", "shared_error", "shared_share", "min_alpha", "max_depth_step", "max_depth_spread"}
     assert names - parameters == experts
     assert parameters <= names
+    assert {f"search.{item.name}" for item in fields(options.search)} <= DEFAULTS.keys()
 
 
 def test_the_page_names_those_that_have_no_effect_any_more():
