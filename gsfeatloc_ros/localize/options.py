@@ -30,7 +30,7 @@ class SearchOptions:
 class LocalizerOptions:
     """Settings of a Localizer.
 
-    The node has them, and those of `pose` and `limits`, as parameters `localizer.*`, and those of `search` as `search.*`.
+    The node has them, and those of `pose` and `limits`, as parameters `localizer.*`; those of `search` are `search.*`.
     """
 
     max_image_width: int = parameter(640, "Wider images are resized to this many pixels first.", (64, 16384), live=True)
