@@ -29,6 +29,9 @@ from gsfeatloc_ros.ros_io.outcome import Outcome
 from gsfeatloc_ros.ros_io.prior import Prior
 from gsfeatloc_ros.ros_io.state import Decision, State
 
+# Standard deviations: an answer may be as far from the prior as it likes.
+_ANY_DEVIATION = 1e6
+
 
 @dataclass(frozen=True, eq=False)
 class Job:
@@ -171,7 +174,7 @@ class Attempts:
             if job.shared and self.publishing:
                 publishers.publish_refused(job.message, str(error))
             return JobResult(Outcome.refused(error))
-        localizer = engine.with_options(self._options(engine.options, job)).localizer
+        localizer = engine.with_options(self._options(engine.options, job, query)).localizer
         trace = localizer.trace(
             query.image, query.camera, query.T_map_camera_prior, query.prior_covariance, interrupted
         )
@@ -193,10 +196,17 @@ class Attempts:
             self._follower.take_requested(query, header, T_map_camera)
         return result
 
-    def _options(self, options: LocalizerOptions, job: Job) -> LocalizerOptions:
-        """Return the options for a job: what was searched in vain is searched otherwise, with another seed."""
-        if self._follower.state.failures:
-            options = replace(options, seed=(options.seed + self._follower.state.failures) % (MAX_SEED + 1))
+    def _options(self, options: LocalizerOptions, job: Job, query: LocalizerInput) -> LocalizerOptions:
+        """Return the options for a job.
+
+        What was searched in vain is searched otherwise, with another seed. The robot may have been carried off by then:
+        its last answer says where to look first, and no more.
+        """
+        failures = self._follower.state.failures
+        if failures:
+            options = replace(options, seed=(options.seed + failures) % (MAX_SEED + 1))
+        if failures and query.source is not None and query.source.own:
+            options = replace(options, limits=replace(options.limits, max_deviation=_ANY_DEVIATION))
         if job.max_seconds > 0:
             options = replace(options, search=replace(options.search, max_seconds=job.max_seconds))
         return options
