@@ -84,7 +84,7 @@ class Diagnostic:
 
     @property
     def part(self) -> str:
-        """Which part of the node it is about: "localization", "health" or "map"."""
+        """Which part of the node it is about: "localization", "health", "state", "index" or "map"."""
         return self.name.rpartition(": ")[2]
 
 

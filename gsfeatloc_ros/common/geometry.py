@@ -108,6 +108,12 @@ def interpolate(pose_a: np.ndarray, pose_b: np.ndarray, fraction: float) -> np.n
     return make_pose(pose_a[:3, :3] @ so3_exp(fraction * turn), translation)
 
 
+def flattened(pose: np.ndarray) -> np.ndarray:
+    """Return the pose (4, 4) on the plane z = 0 and upright that has the same x, y and yaw."""
+    yaw = np.arctan2(pose[1, 0], pose[0, 0])
+    return make_pose(so3_exp(np.array([0.0, 0.0, yaw])), [pose[0, 3], pose[1, 3], 0.0])
+
+
 def rotate_covariance(covariance: np.ndarray, rotation: np.ndarray) -> np.ndarray:
     """Turn the covariance (6, 6) of a pose from the axes of frame b to those of frame a, by R_a_b (3, 3)."""
     both = np.kron(np.eye(2), rotation)

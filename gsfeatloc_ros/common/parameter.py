@@ -15,7 +15,7 @@ Settings = TypeVar("Settings")
 
 Value = str | bool | int | float | tuple[float, ...]
 
-_KEY = "parameter"
+_KEY, _GROUP = "parameter", "group"
 
 
 @dataclass(frozen=True)
@@ -56,13 +56,18 @@ def parameter(
     return field(default=default, metadata={_KEY: about})
 
 
+def group(name: str) -> Mapping[str, str]:
+    """Return the metadata of a field of settings whose parameters are in a group of their own, wherever it is."""
+    return {_GROUP: f"{name}."}
+
+
 def parameters_of(settings: type, prefix: str = "") -> Iterator[Parameter]:
-    """Yield the parameters of a dataclass, and those of the fields that are dataclasses themselves, under `prefix`."""
+    """Yield the parameters of a dataclass, and of its fields that are dataclasses, under `prefix` or in their group."""
     for item in fields(settings):
         if _KEY in item.metadata:
             yield replace(item.metadata[_KEY], name=prefix + item.name)
         elif is_dataclass(item.default_factory):
-            yield from parameters_of(cast(type, item.default_factory), prefix)
+            yield from parameters_of(cast(type, item.default_factory), item.metadata.get(_GROUP, prefix))
 
 
 def settings_from(settings: type[Settings], values: Mapping[str, Value], prefix: str = "") -> Settings:
@@ -73,5 +78,6 @@ def settings_from(settings: type[Settings], values: Mapping[str, Value], prefix:
             if prefix + item.name in values:
                 arguments[item.name] = values[prefix + item.name]
         elif is_dataclass(item.default_factory):
-            arguments[item.name] = settings_from(cast(type, item.default_factory), values, prefix)
+            nested = item.metadata.get(_GROUP, prefix)
+            arguments[item.name] = settings_from(cast(type, item.default_factory), values, nested)
     return settings(**arguments)

@@ -6,10 +6,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from gsfeatloc_ros.common.parameter import parameter
+from gsfeatloc_ros.common.parameter import group, parameter
 from gsfeatloc_ros.localize.evidence import Limits
 from gsfeatloc_ros.pose.lift import LiftOptions
 from gsfeatloc_ros.pose.solve import PoseOptions
+
+MAX_SEED = 2**31 - 1
 
 
 @dataclass(frozen=True)
@@ -26,7 +28,10 @@ class SearchOptions:
 
 @dataclass(frozen=True)
 class LocalizerOptions:
-    """Settings of a Localizer; the node has them, and those of `pose` and `limits`, as parameters `localizer.*`."""
+    """Settings of a Localizer.
+
+    The node has them, and those of `pose` and `limits`, as parameters `localizer.*`; those of `search` are `search.*`.
+    """
 
     max_image_width: int = parameter(640, "Wider images are resized to this many pixels first.", (64, 16384), live=True)
     max_passes: int = parameter(4, "Most renders at estimates to which an image is tracked.", (1, 20), live=True)
@@ -40,9 +45,9 @@ class LocalizerOptions:
         0.5, "Standard deviation of the prior in map units along each axis.", (1e-6, 1e6), live=True
     )
     seed: int = parameter(
-        0, "Seed of RANSAC and of the search: the same seed gives the same answer.", (0, 2**31 - 1), live=True
+        0, "Seed of RANSAC and of the search: the same seed gives the same answer.", (0, MAX_SEED), live=True
     )
-    search: SearchOptions = field(default_factory=SearchOptions)
+    search: SearchOptions = field(default_factory=SearchOptions, metadata=group("search"))
     pose: PoseOptions = field(default_factory=PoseOptions)
     limits: Limits = field(default_factory=Limits)
     lift: LiftOptions = field(default_factory=LiftOptions)

@@ -5,21 +5,32 @@ from __future__ import annotations
 import traceback
 from collections.abc import Callable
 from concurrent.futures import Future
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from threading import Lock
 
+from geometry_msgs.msg import PoseArray
 from sensor_msgs.msg import CompressedImage, Image
+from std_msgs.msg import Header
 
 from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.stage_clock import Interrupted
+from gsfeatloc_ros.index import ViewIndex
 from gsfeatloc_ros.localize.engine import Engine
-from gsfeatloc_ros.localize.options import LocalizerOptions
-from gsfeatloc_ros.node.publishers import Answer, Publishers
+from gsfeatloc_ros.localize.options import MAX_SEED, LocalizerOptions
+from gsfeatloc_ros.node.diagnostics import prior_texts, protection_texts
+from gsfeatloc_ros.node.pose_file import PoseFile
+from gsfeatloc_ros.node.publishers import Answer, Extrinsics, Publishers
 from gsfeatloc_ros.node.report import Report
+from gsfeatloc_ros.node.standing import StandingPublisher
 from gsfeatloc_ros.node.worker import Worker
-from gsfeatloc_ros.ros_io.decode import nanoseconds
-from gsfeatloc_ros.ros_io.inputs import Inputs
+from gsfeatloc_ros.ros_io.follower import Follower
+from gsfeatloc_ros.ros_io.inputs import LocalizerInput
 from gsfeatloc_ros.ros_io.outcome import Outcome
 from gsfeatloc_ros.ros_io.prior import Prior
+from gsfeatloc_ros.ros_io.state import Decision, State
+
+# Standard deviations: an answer may be as far from the prior as it likes.
+_ANY_DEVIATION = 1e6
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,12 +42,16 @@ class Job:
         camera: of the image; None for that of the newest camera_info.
         prior: where it was taken; None for the newest.
         shared: whether the answer is for all, on the topics, or only for the one who asks.
+        kept: whether, asked for by one alone, it is gone on from all the same.
+        max_seconds: that the search may take; 0 for what the options say.
     """
 
     message: Image | CompressedImage
     camera: Camera | None = None
     prior: Prior | None = None
     shared: bool = True
+    kept: bool = True
+    max_seconds: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,10 +61,31 @@ class JobResult:
     Attributes:
         outcome: of the image.
         answer: as it is published; None unless localized.
+        candidates: poses that explain the image about equally well, if that is why there is no answer.
+        prior: what is known of the prior, by key.
     """
 
     outcome: Outcome
     answer: Answer | None = None
+    candidates: PoseArray | None = None
+    prior: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Outputs:
+    """Where what came of an image goes.
+
+    Attributes:
+        publishers: of the answers that are for all.
+        standing: says where the robot stands.
+        pose_file: keeps the last good pose.
+        report: of how it goes.
+    """
+
+    publishers: Publishers
+    standing: StandingPublisher
+    pose_file: PoseFile
+    report: Report
 
 
 class Attempts:
@@ -57,18 +93,16 @@ class Attempts:
 
     Args:
         engine: that localizes.
-        inputs: what images are localized with.
-        publishers: of the answers that are for all.
-        report: of how it goes.
-        track: whether the next image goes on from an answer.
+        follower: says what images start from, and which answers are gone on from.
+        outputs: where the answers go.
 
     Attributes:
         publishing: whether answers are published, even those that are for all.
     """
 
-    def __init__(self, engine: Engine, inputs: Inputs, publishers: Publishers, report: Report, track: bool) -> None:
-        self._engine, self._inputs, self._publishers = engine, inputs, publishers
-        self._report, self._track = report, track
+    def __init__(self, engine: Engine, follower: Follower, outputs: Outputs) -> None:
+        self._engine, self._follower, self._outputs = engine, follower, outputs
+        self._engine_lock = Lock()
         self.publishing = False
         self._worker: Worker[Job, JobResult] = Worker(self._attempt)
 
@@ -96,11 +130,19 @@ class Attempts:
 
     def use_map(self, engine: Engine) -> None:
         """Go on with the map of another engine."""
-        self._engine = engine.with_options(self._engine.options)
+        with self._engine_lock:
+            self._engine = engine.with_options(self._engine.options)
 
     def use_options(self, options: LocalizerOptions) -> None:
         """Go on with other options of the localizer."""
-        self._engine = self._engine.with_options(options)
+        with self._engine_lock:
+            self._engine = self._engine.with_options(options)
+
+    def use_index(self, engine: Engine, index: ViewIndex) -> None:
+        """Go on with the view index of an engine's map, if that is still the map in use."""
+        with self._engine_lock:
+            if self._engine.renderer is engine.renderer:
+                self._engine = self._engine.with_index(index)
 
     # In the worker's thread.
 
@@ -114,33 +156,76 @@ class Attempts:
         except Exception as error:
             # Not foreseen: a bug, or out of memory. The next image may well do.
             result, stack = JobResult(Outcome.error(error)), traceback.format_exc()
-        protection = result.answer.protection if result.answer else None
-        self._report.publish_attempt(job.message.header.stamp, result.outcome, protection, stack)
+        about = result.prior | {"state": self._follower.state.standing().state.value}
+        if result.answer:
+            about |= protection_texts(result.answer.protection)
+        self._outputs.report.publish_attempt(job.message.header.stamp, result.outcome, about, stack)
         return result
 
     def _localize(self, job: Job, interrupted: Callable[[], bool]) -> JobResult:
-        engine, header = self._engine, job.message.header
+        engine, header, publishers = self._engine, job.message.header, self._outputs.publishers
+        resets = self._follower.state.resets
+        if self._follower.state.standing().state is State.LOST:
+            publishers.forget()
         try:
-            query = self._inputs.for_image(job.message, job.camera, job.prior)
-            extrinsics = self._publishers.extrinsics(header, job.shared)
+            query = self._follower.for_image(job.message, job.camera, job.prior)
+            extrinsics = publishers.extrinsics(header, job.shared)
         except ValueError as error:
             if job.shared and self.publishing:
-                self._publishers.publish_refused(job.message, str(error))
+                publishers.publish_refused(job.message, str(error))
             return JobResult(Outcome.refused(error))
-        trace = engine.localizer.trace(
+        localizer = engine.with_options(self._options(engine.options, job, query)).localizer
+        trace = localizer.trace(
             query.image, query.camera, query.T_map_camera_prior, query.prior_covariance, interrupted
         )
-        if self._engine.renderer is not engine.renderer:
-            return JobResult(Outcome.refused("the map was changed while this image was localized: send another"))
-        outcome, T_map_camera = Outcome.of(trace.estimate), trace.estimate.T_map_camera
-        answer = self._publishers.answer(trace.estimate, extrinsics, header)
+        if self._engine.renderer is not engine.renderer or self._follower.state.resets != resets:
+            return JobResult(Outcome.refused("the map or the state was changed while this image was localized"))
+        result = JobResult(
+            Outcome.of(trace.estimate),
+            publishers.answer(trace.estimate, extrinsics, header),
+            publishers.candidates(trace.estimate, extrinsics, header) if trace.estimate.candidates else None,
+            prior_texts(query),
+        )
         if job.shared:
-            self._report.camera.take(query.camera, trace.estimate)
+            self._outputs.report.camera.take(query.camera, trace.estimate)
+        T_map_camera = trace.estimate.T_map_camera
         if job.shared and self.publishing:
-            if answer is not None and T_map_camera is not None:
-                self._report.count_answer()
-                self._publishers.publish_answer(answer, T_map_camera, extrinsics)
-                if self._track:
-                    self._inputs.take_answer(T_map_camera, nanoseconds(header.stamp), query.prior)
-            self._publishers.publish_pictures(trace, header)
-        return JobResult(outcome, answer)
+            result = self._share(result, query, extrinsics, job.message.header)
+            publishers.publish_pictures(trace, header)
+        elif job.kept and not job.shared and T_map_camera is not None:
+            self._follower.take_requested(query, header, T_map_camera)
+        return result
+
+    def _options(self, options: LocalizerOptions, job: Job, query: LocalizerInput) -> LocalizerOptions:
+        """Return the options for a job.
+
+        What was searched in vain is searched otherwise, with another seed. The robot may have been carried off by then:
+        its last answer says where to look first, and no more.
+        """
+        failures = self._follower.state.failures
+        if failures:
+            options = replace(options, seed=(options.seed + failures) % (MAX_SEED + 1))
+        if failures and query.source is not None and query.source.own:
+            options = replace(options, limits=replace(options.limits, max_deviation=_ANY_DEVIATION))
+        if job.max_seconds > 0:
+            options = replace(options, search=replace(options.search, max_seconds=job.max_seconds))
+        return options
+
+    def _share(self, result: JobResult, query: LocalizerInput, extrinsics: Extrinsics, header: Header) -> JobResult:
+        """Publish what came of an image, go on from it, and return what is to be said of it."""
+        outputs, estimate = self._outputs, result.outcome.estimate
+        assert estimate is not None  # it was tried
+        T_map_camera = estimate.T_map_camera
+        judgement = self._follower.take(query, header, T_map_camera)
+        if judgement.decision is Decision.AWAIT:
+            result = replace(result, outcome=Outcome.unconfirmed(estimate, judgement.note), answer=None)
+        elif result.answer is not None and T_map_camera is not None:
+            outputs.report.count_answer()
+            outputs.publishers.publish_answer(result.answer, T_map_camera, extrinsics)
+            outputs.pose_file.take(T_map_camera)
+            if judgement.note:
+                outputs.report.note(judgement.note)
+        elif result.candidates is not None:
+            outputs.publishers.publish_candidates(result.candidates)
+        outputs.standing.publish_change()
+        return result

@@ -12,6 +12,8 @@ from rclpy.node import Node
 from gsfeatloc_ros.localize.estimate import Estimate
 from gsfeatloc_ros.localize.protection import ProtectionLevel
 from gsfeatloc_ros.node.qos import RELIABLE
+from gsfeatloc_ros.ros_io.growth import position_sigma, rotation_sigma
+from gsfeatloc_ros.ros_io.inputs import LocalizerInput
 from gsfeatloc_ros.ros_io.outcome import OutcomeStatus
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
@@ -20,6 +22,8 @@ LEVELS = {
     OutcomeStatus.LOCALIZED: OK,
     OutcomeStatus.REJECTED: WARN,
     OutcomeStatus.FAILED: WARN,
+    OutcomeStatus.AMBIGUOUS: WARN,
+    OutcomeStatus.UNCONFIRMED: WARN,
     OutcomeStatus.REFUSED: ERROR,
     OutcomeStatus.ERROR: ERROR,
 }
@@ -46,9 +50,28 @@ def protection_texts(level: ProtectionLevel) -> dict[str, str]:
     }
 
 
+def prior_texts(query: LocalizerInput) -> dict[str, str]:
+    """Return what an image was localized with, by key: map units, degrees."""
+    source = "none" if query.source is None else query.source.value
+    if query.prior_covariance is None:
+        return {"prior": source}
+    return {
+        "prior": source,
+        "prior_sigma": f"{position_sigma(query.prior_covariance):.2g}",
+        "prior_sigma_deg": f"{math.degrees(rotation_sigma(query.prior_covariance)):.2g}",
+    }
+
+
 def stage_texts(estimate: Estimate) -> dict[str, str]:
     """Return the milliseconds of an estimate's stages by key."""
     return {f"ms_{stage}": f"{duration:.1f}" for stage, duration in estimate.milliseconds.items()}
+
+
+def status_message(node: Node, part: str, level: bytes, message: str, values: dict[str, str]) -> DiagnosticStatus:
+    """Return the status of a part of a node."""
+    name = f"{node.get_fully_qualified_name().lstrip('/')}: {part}"
+    pairs = [KeyValue(key=key, value=value) for key, value in values.items()]
+    return DiagnosticStatus(level=level, name=name, message=message, values=pairs)
 
 
 class Reporter:
@@ -68,14 +91,16 @@ class Reporter:
         self._node.get_logger().warning(reason)
         return True
 
+    def info(self, reason: str) -> None:
+        """Log what is worth knowing."""
+        self._node.get_logger().info(reason)
+
     def error(self, reason: str) -> None:
         """Log an error."""
         self._node.get_logger().error(reason)
 
     def diagnose(self, part: str, level: bytes, message: str, values: dict[str, str]) -> None:
         """Publish the status of a part of the node."""
-        name = f"{self._node.get_fully_qualified_name().lstrip('/')}: {part}"
-        pairs = [KeyValue(key=key, value=value) for key, value in values.items()]
-        array = DiagnosticArray(status=[DiagnosticStatus(level=level, name=name, message=message, values=pairs)])
+        array = DiagnosticArray(status=[status_message(self._node, part, level, message, values)])
         array.header.stamp = self._node.get_clock().now().to_msg()
         self._publisher.publish(array)

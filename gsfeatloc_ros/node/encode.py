@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from array import array
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import PoseWithCovarianceStamped
+from geometry_msgs.msg import Point, Pose, PoseArray, PoseWithCovarianceStamped, Quaternion
 from sensor_msgs.msg import Image
 from std_msgs.msg import Header
 
@@ -28,14 +29,22 @@ def image_message(pixels: np.ndarray, header: Header) -> Image:
 def pose_message(pose: np.ndarray, covariance: np.ndarray, header: Header) -> PoseWithCovarianceStamped:
     """Return a pose (4, 4) with its covariance (6, 6), in ROS order about the axes of its frame, as a message."""
     message = PoseWithCovarianceStamped(header=header)
-    position, orientation = message.pose.pose.position, message.pose.pose.orientation
-    position.x, position.y, position.z = pose[:3, 3].tolist()
-    quaternion = quaternion_from_matrix(pose[:3, :3])
-    orientation.x, orientation.y, orientation.z, orientation.w = quaternion.tolist()
+    message.pose.pose = _pose(pose)
     message.pose.covariance = covariance.ravel().tolist()
     return message
+
+
+def pose_array_message(poses: Sequence[np.ndarray], header: Header) -> PoseArray:
+    """Return poses (4, 4) as a message."""
+    return PoseArray(header=header, poses=[_pose(pose) for pose in poses])
 
 
 def protection_message(level: ProtectionLevel, header: Header) -> Any:
     """Return a protection level as a ProtectionLevel of gsfeatloc_interfaces, which must be there."""
     return ProtectionLevelMessage(header=header, radius=level.radius, angle=level.angle, risk=RISK)
+
+
+def _pose(pose: np.ndarray) -> Pose:
+    x, y, z = pose[:3, 3].tolist()
+    qx, qy, qz, qw = quaternion_from_matrix(pose[:3, :3]).tolist()
+    return Pose(position=Point(x=x, y=y, z=z), orientation=Quaternion(x=qx, y=qy, z=qz, w=qw))

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from threading import Lock
 
 import numpy as np
-from geometry_msgs.msg import PoseWithCovarianceStamped
+from geometry_msgs.msg import PoseArray, PoseWithCovarianceStamped
 from rclpy.duration import Duration
 from rclpy.node import Node
 from sensor_msgs.msg import CompressedImage, Image
 from std_msgs.msg import Header
 
-from gsfeatloc_ros.common.geometry import shift_covariance
+from gsfeatloc_ros.common.geometry import flattened, invert, shift_covariance
 from gsfeatloc_ros.localize.estimate import Estimate, Trace
 from gsfeatloc_ros.localize.protection import ProtectionLevel, protection_level
-from gsfeatloc_ros.node.encode import image_message, pose_message, protection_message
+from gsfeatloc_ros.node.encode import image_message, pose_array_message, pose_message, protection_message
 from gsfeatloc_ros.node.interfaces import ProtectionLevelMessage
 from gsfeatloc_ros.node.qos import LATCHED, RELIABLE, overridable
 from gsfeatloc_ros.node.settings import BASE, Settings
@@ -34,10 +35,21 @@ class Extrinsics:
     Attributes:
         T_camera_body: (4, 4) of the body that answers are poses of: the base, or the camera itself.
         T_camera_odom: (4, 4) of the odometry's frame; None where no transform is broadcast.
+        T_camera_base: (4, 4) of the base; None unless the transform is kept flat.
     """
 
     T_camera_body: np.ndarray
     T_camera_odom: np.ndarray | None
+    T_camera_base: np.ndarray | None
+
+    def T_map_odom(self, T_map_camera: np.ndarray) -> np.ndarray | None:
+        """Return the transform (4, 4) that follows from a pose (4, 4) of the camera; None where none is broadcast."""
+        if self.T_camera_odom is None:
+            return None
+        if self.T_camera_base is None:
+            return T_map_camera @ self.T_camera_odom
+        T_odom_base = invert(self.T_camera_odom) @ self.T_camera_base
+        return flattened(T_map_camera @ self.T_camera_base) @ invert(flattened(T_odom_base))
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,17 +72,19 @@ class Publishers:
         node: whose they are.
         settings: of the node.
         transforms: of the robot.
+        is_lost: whether no transform is to be broadcast, for nobody knows where the robot is.
 
     Raises:
         ValueError: a transform is to be broadcast, but tf is not installed, or nobody said that the map is aligned.
     """
 
-    def __init__(self, node: Node, settings: Settings, transforms: Transforms) -> None:
-        self._node = node
+    def __init__(self, node: Node, settings: Settings, transforms: Transforms, is_lost: Callable[[], bool]) -> None:
+        self._node, self._is_lost = node, is_lost
         self._transforms = transforms
         self._map_frame, self._base_frame = settings.map.frame_id, settings.node.base_frame
         self._of_base = settings.node.pose_frame == BASE
         self._odom_frame = settings.node.odom_frame if settings.node.publish_tf else ""
+        self._flat = settings.node.planar_tf
         self._tolerance = Duration(nanoseconds=int(1e9 * settings.node.transform_tolerance))
         self._T_map_odom: np.ndarray | None = None
         # An answer and the timer broadcast in threads of their own; stamps must not go back.
@@ -82,7 +96,12 @@ class Publishers:
                 "publish_tf needs map.aligned: set it to true once map.scale, map.translation and map.rotation put the "
                 "map where the robot's map frame is; other nodes would believe a pose that is off"
             )
-        if self._odom_frame or self._of_base:
+        if settings.recovery.planar and not settings.map.aligned:
+            raise ValueError(
+                "search.planar needs map.aligned: set it to true once map.scale, map.translation and map.rotation put "
+                "the map where the floor is z = 0"
+            )
+        if self._odom_frame or self._of_base or settings.recovery.planar:
             transforms.listen()
         self._pose = node.create_publisher(
             PoseWithCovarianceStamped, "pose", LATCHED, qos_overriding_options=overridable()
@@ -94,6 +113,9 @@ class Publishers:
             )
         self._render = node.create_publisher(Image, "rendered_image", RELIABLE, qos_overriding_options=overridable())
         self._debug = node.create_publisher(Image, "debug_image", RELIABLE, qos_overriding_options=overridable())
+        self._candidates = node.create_publisher(
+            PoseArray, "~/candidates", RELIABLE, qos_overriding_options=overridable()
+        )
         self._changed = node.create_publisher(Image, "~/changed", RELIABLE, qos_overriding_options=overridable())
         self._timer = node.create_timer(_TRANSFORM_PERIOD, self._broadcast) if self._odom_frame else None
 
@@ -104,7 +126,14 @@ class Publishers:
 
     def close(self) -> None:
         """Publish nothing more."""
-        for publisher in (self._pose, self._protection, self._render, self._debug, self._changed):
+        for publisher in (
+            self._pose,
+            self._protection,
+            self._render,
+            self._debug,
+            self._changed,
+            self._candidates,
+        ):
             if publisher is not None:
                 self._node.destroy_publisher(publisher)
         if self._timer:
@@ -118,12 +147,14 @@ class Publishers:
             shared: whether the answer is for all, tf among them.
         """
         stamp, camera_frame = nanoseconds(header.stamp), header.frame_id
-        T_camera_body, T_camera_odom = np.eye(4), None
+        T_camera_body, T_camera_odom, T_camera_base = np.eye(4), None, None
         if self._of_base:
             T_camera_body = self._transforms.lookup(camera_frame, self._base_frame, stamp)
         if self._odom_frame and shared:
             T_camera_odom = self._transforms.lookup(camera_frame, self._odom_frame, stamp)
-        return Extrinsics(T_camera_body, T_camera_odom)
+            if self._flat:
+                T_camera_base = self._transforms.lookup(camera_frame, self._base_frame, stamp)
+        return Extrinsics(T_camera_body, T_camera_odom, T_camera_base)
 
     def answer(self, estimate: Estimate, extrinsics: Extrinsics, header: Header) -> Answer | None:
         """Return the answer to the image of a header; None where the estimate is none."""
@@ -134,6 +165,15 @@ class Publishers:
         covariance = shift_covariance(estimate.covariance, lever)
         pose = pose_message(T_map_body, covariance, Header(stamp=header.stamp, frame_id=self._map_frame))
         return Answer(pose, protection_level(covariance))
+
+    def candidates(self, estimate: Estimate, extrinsics: Extrinsics, header: Header) -> PoseArray:
+        """Return the poses that explain the image of a header about equally well, of the body that answers are of."""
+        poses = [pose @ extrinsics.T_camera_body for pose in estimate.candidates]
+        return pose_array_message(poses, Header(stamp=header.stamp, frame_id=self._map_frame))
+
+    def publish_candidates(self, candidates: PoseArray) -> None:
+        """Publish poses of which nobody knows which is the right one."""
+        self._candidates.publish(candidates)
 
     def publish_answer(self, answer: Answer, T_map_camera: np.ndarray, extrinsics: Extrinsics) -> None:
         """Publish an answer, and from now on the transform that follows from it.
@@ -148,8 +188,9 @@ class Publishers:
         if self._protection is not None:
             self._protection.publish(protection_message(answer.protection, header))
         self.last_stamp = nanoseconds(header.stamp)
-        if extrinsics.T_camera_odom is not None:
-            self._T_map_odom = T_map_camera @ extrinsics.T_camera_odom
+        T_map_odom = extrinsics.T_map_odom(T_map_camera)
+        if T_map_odom is not None:
+            self._T_map_odom = T_map_odom
             self._broadcast()
 
     def publish_pictures(self, trace: Trace, header: Header) -> None:
@@ -182,6 +223,6 @@ class Publishers:
     def _broadcast(self) -> None:
         with self._broadcast_lock:
             T_map_odom = self._T_map_odom
-            if T_map_odom is not None:
+            if T_map_odom is not None and not self._is_lost():
                 stamp = (self._node.get_clock().now() + self._tolerance).to_msg()
                 self._transforms.broadcast(self._map_frame, self._odom_frame, T_map_odom, stamp)

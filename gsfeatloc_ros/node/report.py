@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 from builtin_interfaces.msg import Time
 
-from gsfeatloc_ros.localize.protection import ProtectionLevel
 from gsfeatloc_ros.node.diagnostics import (
     ERROR,
     LEVELS,
@@ -17,7 +16,6 @@ from gsfeatloc_ros.node.diagnostics import (
     WARN,
     Reporter,
     estimate_texts,
-    protection_texts,
     stage_texts,
     stamp_text,
 )
@@ -152,15 +150,13 @@ class Report:
             stamped = {"stamp": stamp_text(stamp)} if stamp else {}
             self._diagnose(ERROR, OutcomeStatus.REFUSED.value, reason, stamped)
 
-    def publish_attempt(
-        self, stamp: Time, outcome: Outcome, protection: ProtectionLevel | None, traceback: str = ""
-    ) -> None:
+    def publish_attempt(self, stamp: Time, outcome: Outcome, about: dict[str, str], traceback: str = "") -> None:
         """Publish, and log unless it ended well, what came of the image of a stamp.
 
         Args:
             stamp: of the image.
             outcome: what came of it.
-            protection: how far the answer may be off; None where there is none.
+            about: what else there is to know, by key.
             traceback: of the exception, if that is what came of it.
         """
         if outcome.status is OutcomeStatus.ERROR:
@@ -169,8 +165,12 @@ class Report:
             self._reporter.warn(outcome.status.value, outcome.reason)
         self.health.count_attempt(outcome)
         texts = {} if outcome.estimate is None else estimate_texts(outcome.estimate)
-        values = {"stamp": stamp_text(stamp)} | texts | (protection_texts(protection) if protection else {})
+        values = {"stamp": stamp_text(stamp)} | texts | about
         self._diagnose(LEVELS[outcome.status], outcome.status.value, outcome.reason, values)
+
+    def note(self, reason: str) -> None:
+        """Log what is remarkable about an answer: the robot was found again, or its pose jumps."""
+        self._reporter.warn("note", reason)
 
     def publish_health(self, level: bytes, reason: str, about: dict[str, str]) -> None:
         """Publish how the session does, with what there is to know about it; a wrong calibration explains much."""

@@ -1,4 +1,4 @@
-"""The services ~/relocalize and ~/localize_image."""
+"""The services ~/relocalize, ~/localize_image and reinitialize_global_localization."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 import rclpy.task
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
-from std_srvs.srv import Trigger
+from std_srvs.srv import Empty, Trigger
 
 from gsfeatloc_ros.common.stage_clock import Interrupted
 from gsfeatloc_ros.node.attempts import Attempts, Job, JobResult
@@ -43,6 +43,8 @@ class Services:
         # Reentrant: a request that waits for the worker must not hold up the next one.
         group = ReentrantCallbackGroup()
         node.create_service(Trigger, "~/relocalize", self._on_relocalize, callback_group=group)
+        # Of this name, in the node's namespace, as AMCL has it: Nav2's recovery calls it.
+        node.create_service(Empty, "reinitialize_global_localization", self._on_reinitialize)
         if LocalizeImage is None:
             node.get_logger().info(
                 "the service ~/localize_image and the topic protection_level are off: build the package "
@@ -61,6 +63,15 @@ class Services:
         response.success, response.message = result.answer is not None, result.outcome.reason
         return response
 
+    def _on_reinitialize(self, request: Empty.Request, response: Empty.Response) -> Empty.Response:
+        """Forget where the robot is."""
+        session = self._session()
+        if session is None:
+            self._node.get_logger().warning(f"reinitialize_global_localization: {_UNCONFIGURED}")
+        else:
+            session.lose("asked for by reinitialize_global_localization")
+        return response
+
     async def _on_localize_image(self, request: Any, response: Any) -> Any:
         """Localize the image of a LocalizeImage."""
         try:
@@ -75,6 +86,7 @@ class Services:
             OutcomeStatus.FAILED: response.FAILED,
             OutcomeStatus.REFUSED: response.REFUSED,
             OutcomeStatus.ERROR: response.ERROR,
+            OutcomeStatus.AMBIGUOUS: response.AMBIGUOUS,
         }[outcome.status]
         response.reason = outcome.reason
         response.probability_wrong = response.protection_radius = response.protection_angle = math.nan
@@ -82,6 +94,8 @@ class Services:
             response.inliers = outcome.estimate.evidence.inliers
             response.milliseconds = outcome.estimate.milliseconds["total"]
             response.probability_wrong = outcome.estimate.evidence.probability_wrong
+        if result.candidates is not None:
+            response.candidates = result.candidates
         if answer is not None:
             response.pose = answer.pose
             response.protection_radius, response.protection_angle = answer.protection.radius, answer.protection.angle
@@ -121,4 +135,6 @@ def _requested_job(request: Any, session: Session) -> Job:
     prior = None
     if request.has_prior:
         prior = decode_prior(request.prior, PriorSource.REQUEST, settings.prior_policy())
-    return Job(request.image, camera, prior, shared=False)
+    if not (math.isfinite(request.max_seconds) and request.max_seconds >= 0):
+        raise ValueError(f"max_seconds is {request.max_seconds}: 0 for the parameter's, or more")
+    return Job(request.image, camera, prior, shared=False, kept=not request.forget, max_seconds=request.max_seconds)

@@ -2,21 +2,29 @@
 
 from __future__ import annotations
 
+import time
+
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
 from gsfeatloc_ros.localize.engine import Engine
-from gsfeatloc_ros.node.attempts import Attempts
+from gsfeatloc_ros.node.attempts import Attempts, Outputs
 from gsfeatloc_ros.node.diagnostics import OK, Reporter
+from gsfeatloc_ros.node.index_build import IndexBuild
+from gsfeatloc_ros.node.pose_file import PoseFile
 from gsfeatloc_ros.node.publishers import Publishers
 from gsfeatloc_ros.node.reception import Reception
 from gsfeatloc_ros.node.report import Report
-from gsfeatloc_ros.node.settings import ON_REQUEST, Settings
+from gsfeatloc_ros.node.settings import CONTINUOUS, ON_REQUEST, Settings
+from gsfeatloc_ros.node.standing import StandingPublisher
 from gsfeatloc_ros.node.transforms import Transforms
+from gsfeatloc_ros.ros_io.follower import Follower
 from gsfeatloc_ros.ros_io.inputs import Inputs
+from gsfeatloc_ros.ros_io.state import LocalizationState, State
 
-# Seconds between two reports on the node's health, as of diagnostic_updater.
+# Seconds between two reports on the node's health, as of diagnostic_updater, and between two saves of the last pose.
 _HEALTH_PERIOD = 1.0
+_SAVE_PERIOD = 5.0
 
 
 class Session:
@@ -50,22 +58,31 @@ class Session:
         self._node, self._transforms = node, transforms
         self.settings = settings
         self.active = self.closed = False
-        self._publishers = Publishers(node, settings, transforms)
+        state = LocalizationState(settings.recovery.state, lambda: node.get_clock().now().nanoseconds)
+        self._publishers = Publishers(node, settings, transforms, lambda: state.standing().state is State.LOST)
+        self._standing = StandingPublisher(node, state, reporter)
         self._report = Report(reporter, lambda: self.attempts.dropped)
-        self._inputs = Inputs(
+        inputs = Inputs(
             settings.prior_policy(),
             transforms.lookup,
             settings.image.rectified,
             f"no camera_info yet: publish sensor_msgs/CameraInfo on {node.resolve_topic_name('camera_info')}",
-            f"no prior yet: publish geometry_msgs/PoseStamped on {node.resolve_topic_name('prior')}",
         )
-        self._inputs.line_delay = settings.image.line_delay
-        self.attempts = Attempts(engine, self._inputs, self._publishers, self._report, settings.node.track)
-        self.reception = Reception(node, settings, self._inputs, self._report, self.attempts.offer)
+        self._inputs, self._follower = inputs, Follower(inputs, state, settings.node.track)
+        self._pose_file = PoseFile(settings.state.path, settings.map, reporter)
+        self._use_saved_pose()
+        outputs = Outputs(self._publishers, self._standing, self._pose_file, self._report)
+        self.attempts = Attempts(engine, self._follower, outputs)
+        self.reception = Reception(node, settings, inputs, self._report, self.attempts.offer)
+        self._index_build = IndexBuild(self.attempts, reporter)
+        self._index_build.start(settings)
         # On a clock of its own: that of a simulation may stand still.
-        self._timer = node.create_timer(
-            _HEALTH_PERIOD, self._report_health, clock=Clock(clock_type=ClockType.STEADY_TIME)
-        )
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._timers = [
+            node.create_timer(_HEALTH_PERIOD, self._report_health, clock=steady),
+            node.create_timer(_SAVE_PERIOD, self._pose_file.save, clock=steady),
+        ]
+        self.use_settings(settings)
 
     @property
     def engine(self) -> Engine:
@@ -83,37 +100,55 @@ class Session:
             f"{self._publishers.topic}"
         )
         self._report.publish_ready(f"ready: {self.reception.no_image}")
+        self._standing.publish()
 
     def deactivate(self) -> None:
         """Neither listen nor publish."""
         self.active = self.attempts.publishing = False
         self.reception.stop_listening()
+        self._follower.lose("the node was deactivated", with_priors=False)
         self._publishers.forget()
+        self._pose_file.save()
 
     def stop(self, timeout: float) -> bool:
         """Have the running localization given up; return whether it ended within `timeout` seconds.
 
         Requests that still wait are answered when the executor spins on.
         """
-        return self.attempts.stop(timeout)
+        self._pose_file.save()
+        deadline = time.monotonic() + timeout
+        return self.attempts.stop(timeout) & self._index_build.stop(max(0.0, deadline - time.monotonic()))
 
     def close(self) -> None:
         """Take back all that was made, but for the subscriptions, which `deactivate` does."""
         self.closed = True
-        self._node.destroy_timer(self._timer)
+        for timer in self._timers:
+            self._node.destroy_timer(timer)
+        self._standing.close()
         self._publishers.close()
+
+    def lose(self, reason: str) -> None:
+        """Forget where the robot is: it is anywhere in the map."""
+        self._follower.lose(reason, with_priors=True)
+        self._publishers.forget()
+        self._standing.publish()
 
     def use_map(self, engine: Engine) -> None:
         """Go on with the map of another engine; the last answer was in the old one's."""
         self.attempts.use_map(engine)
-        self._inputs.forget_answer()
+        self._follower.lose("the map was changed", with_priors=False)
         self._publishers.forget()
+        self._standing.publish()
+        self._pose_file.use_map(self.settings.map)
+        self._index_build.start(self.settings)
 
     def use_settings(self, settings: Settings) -> None:
         """Go on with other settings, but for those that are read when the node is configured."""
         self.settings = settings
         self._inputs.policy = settings.prior_policy()
         self._inputs.line_delay = settings.image.line_delay
+        self._follower.state.options = settings.recovery.state
+        self._follower.images_come = settings.node.mode != ON_REQUEST
         self.reception.use_settings(settings)
         self.attempts.use_options(settings.localizer)
 
@@ -121,10 +156,20 @@ class Session:
         """Forget what is stamped later than `stamp` (nanoseconds): time went back."""
         self._transforms.forget()
         self._inputs.forget_after(stamp)
+        self._follower.lose("time went back", with_priors=False)
         self._publishers.forget()
+
+    def _use_saved_pose(self) -> None:
+        pose = self._pose_file.load() if self.settings.node.track else None
+        if pose is not None:
+            sigma = self.settings.recovery.state.lost_distance
+            self._inputs.start_from(self.settings.prior_policy().saved(pose, sigma))
 
     def _report_health(self) -> None:
         mode, last = self.settings.node.mode, self._publishers.last_stamp
+        if self.active:
+            self._follower.pass_time(mode == CONTINUOUS)
+            self._standing.publish()
         level, reason = OK, "inactive"
         if self.active:
             level, reason = self._report.health.assess(

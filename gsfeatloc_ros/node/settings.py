@@ -5,10 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from gsfeatloc_ros.common.parameter import Value, parameter, parameters_of, settings_from
+from gsfeatloc_ros.common.parameter import Parameter, Value, parameter, parameters_of, settings_from
+from gsfeatloc_ros.index import IndexOptions
 from gsfeatloc_ros.localize.options import LocalizerOptions
 from gsfeatloc_ros.localize.settings import MapSettings, MatcherSettings, RendererSettings
+from gsfeatloc_ros.ros_io.growth import GrowthOptions
 from gsfeatloc_ros.ros_io.prior import PriorPolicy
+from gsfeatloc_ros.ros_io.state import StateOptions
 
 CONTINUOUS, ON_PRIOR, ON_REQUEST = "continuous", "on_prior", "on_request"
 CAMERA, BASE = "camera", "base"
@@ -47,17 +50,23 @@ class NodeSettings:
     publish_tf: bool = parameter(
         False, "Broadcast the transform from the map's frame to odom_frame; needs map.aligned."
     )
+    planar_tf: bool = parameter(
+        False, "Keep that transform flat, x, y and yaw alone: for a robot whose base stays on the map's plane z = 0."
+    )
     transform_tolerance: float = parameter(
         0.1, "Seconds by which the stamp of that transform is ahead of the clock.", (0.0, 10.0)
     )
     prior_max_age: float = parameter(
         _POLICY.max_age,
-        "Seconds by which a prior, or the last answer, may be older or newer than the image; 0 for no limit.",
+        "Seconds for which a prior holds as it is; round an older one a wider space is searched. It may be newer than "
+        "the image by no more. 0 for no limit.",
         (0.0, 1e6),
         live=True,
     )
     odometry_max_age: float = parameter(
-        _POLICY.odometry_max_age, "The same where odometry carries it to the image's time.", (0.0, 3600.0)
+        _POLICY.odometry_max_age,
+        "Seconds over which odometry carries a prior, or the last answer, to the image's time.",
+        (0.0, 3600.0),
     )
 
 
@@ -86,6 +95,28 @@ class ImageSettings:
 
 
 @dataclass(frozen=True)
+class RecoverySettings:
+    """How a robot is followed between answers, and found again."""
+
+    planar: bool = parameter(
+        False,
+        "Whether the base stays upright on the map's plane z = 0: without a prior, only x, y and yaw are unknown. "
+        "Needs map.aligned, and tf from the base to the camera.",
+    )
+    growth: GrowthOptions = field(default_factory=GrowthOptions)
+    state: StateOptions = field(default_factory=StateOptions)
+
+
+@dataclass(frozen=True)
+class StateSettings:
+    """What is kept for the next start."""
+
+    path: str = parameter(
+        "", "Path of a file in which the last good pose is saved; the next start, with track, looks there first."
+    )
+
+
+@dataclass(frozen=True)
 class Settings:
     """All settings of the node, by the groups of its parameters; those of `node` are in no group."""
 
@@ -95,6 +126,9 @@ class Settings:
     matcher: MatcherSettings = field(default_factory=MatcherSettings)
     renderer: RendererSettings = field(default_factory=RendererSettings)
     localizer: LocalizerOptions = field(default_factory=LocalizerOptions)
+    recovery: RecoverySettings = field(default_factory=RecoverySettings)
+    state: StateSettings = field(default_factory=StateSettings)
+    index: IndexOptions = field(default_factory=IndexOptions)
 
     @staticmethod
     def of(values: Mapping[str, Value]) -> Settings:
@@ -106,6 +140,9 @@ class Settings:
             matcher=settings_from(MatcherSettings, values, "matcher."),
             renderer=settings_from(RendererSettings, values, "renderer."),
             localizer=settings_from(LocalizerOptions, values, "localizer."),
+            recovery=settings_from(RecoverySettings, values, "search."),
+            state=settings_from(StateSettings, values, "state."),
+            index=settings_from(IndexOptions, values, "index."),
         )
 
     def prior_policy(self) -> PriorPolicy:
@@ -116,6 +153,10 @@ class Settings:
             of_base=self.node.prior_frame == BASE,
             max_age=self.node.prior_max_age,
             odometry_max_age=self.node.odometry_max_age,
+            translation_sigma=self.localizer.prior_translation,
+            rotation_sigma=self.localizer.prior_rotation,
+            growth=self.recovery.growth,
+            planar=self.recovery.planar,
         )
 
 
@@ -126,5 +167,18 @@ _GROUPS = {
     "matcher.": MatcherSettings,
     "renderer.": RendererSettings,
     "localizer.": LocalizerOptions,
+    "search.": RecoverySettings,
+    "state.": StateSettings,
+    "index.": IndexOptions,
 }
-PARAMETERS = tuple(item for prefix, group in _GROUPS.items() for item in parameters_of(group, prefix))
+_PREFIXES = list(_GROUPS)
+
+
+def _place(parameter: Parameter) -> int:
+    """Return the place of a parameter's group among the others."""
+    return _PREFIXES.index(parameter.name[: parameter.name.rfind(".") + 1])
+
+
+PARAMETERS = tuple(
+    sorted((item for prefix, group in _GROUPS.items() for item in parameters_of(group, prefix)), key=_place)
+)

@@ -83,7 +83,6 @@ class Replay:
             _no_tf,
             rectified,
             "no camera_info was recorded before this image",
-            "no prior was recorded before this image",
         )
         self.truth: list[tuple[int, np.ndarray]] = []
         self.unusable: Counter[tuple[Role, str]] = Counter()

@@ -13,6 +13,7 @@ import numpy as np
 from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.geometry import invert, rotate_covariance, shift_covariance
 from gsfeatloc_ros.ros_io.decode import decode_camera, decode_picture, decode_pose, nanoseconds, picture_size
+from gsfeatloc_ros.ros_io.growth import Growth, position_sigma
 from gsfeatloc_ros.ros_io.message_types import AnyImage
 from gsfeatloc_ros.ros_io.message_types import Odometry as OdometryMessage
 from gsfeatloc_ros.ros_io.odometry import OdometryBuffer
@@ -43,16 +44,23 @@ class LocalizerInput:
     Attributes:
         image: (H, W, 3) uint8 RGB.
         camera: of the image, with its motion while the rows were read, where that is known.
-        T_map_camera_prior: (4, 4).
+        T_map_camera_prior: (4, 4); None where nothing is known.
         prior_covariance: (6, 6) in ROS order about the map's axes, or None where it is not known.
-        prior: what the two were made of.
+        prior: what the two were made of, if anything.
+        newest_prior: the newest that came from outside or was an answer, used or not.
     """
 
     image: np.ndarray
     camera: Camera
-    T_map_camera_prior: np.ndarray
+    T_map_camera_prior: np.ndarray | None
     prior_covariance: np.ndarray | None
-    prior: Prior
+    prior: Prior | None
+    newest_prior: Prior | None
+
+    @property
+    def source(self) -> PriorSource | None:
+        """Where the prior comes from; None where there is none."""
+        return None if self.prior is None else self.prior.source
 
 
 @dataclass(frozen=True)
@@ -72,31 +80,35 @@ class _Newest(Generic[T]):
         return self.value
 
 
+# No prior came: that is no problem.
+_NOTHING: _Newest[Prior] = _Newest()
+
+
 class Inputs:
     """The newest camera_info, prior and odometry, and what follows from them for an image.
 
-    A prior is one that came from outside, or the last answer (`take_answer`); the newest of either counts. Messages may
-    be taken in one thread and images asked for in another.
+    A prior is one that came from outside, or the last answer (`take_answer`); the newest of either counts. Without any,
+    an image may be anywhere in the map, or, of a planar robot, anywhere on its plane. Messages may be taken in one
+    thread and images asked for in another.
 
     Args:
         policy: what priors are worth.
         lookup: of the robot's frames.
         rectified: whether images are.
-        no_camera, no_prior: what to say while there is none.
+        no_camera: what to say while there is no camera_info.
 
     Attributes:
         policy: what priors are worth; may be replaced later.
         line_delay: seconds from a row of images to the next; 0 for a global shutter. May be replaced later.
     """
 
-    def __init__(self, policy: PriorPolicy, lookup: Lookup, rectified: bool, no_camera: str, no_prior: str) -> None:
+    def __init__(self, policy: PriorPolicy, lookup: Lookup, rectified: bool, no_camera: str) -> None:
         self.policy = policy
         self.line_delay = 0.0
         self._lookup = lookup
         self._rectified = rectified
-        self._no_prior = no_prior
         self._camera: _Newest[Camera] = _Newest(problem=no_camera)
-        self._prior: _Newest[Prior] = _Newest(problem=no_prior)
+        self._prior: _Newest[Prior] = _NOTHING
         self._prior_lock = Lock()
         self._odometry = self._no_odometry()
         self._odometry_frame = ""
@@ -104,7 +116,7 @@ class Inputs:
     @property
     def missing(self) -> list[str]:
         """Why no image can be localized now; empty if one can."""
-        return [newest.problem for newest in (self._camera, self._prior) if newest.value is None]
+        return [newest.problem for newest in (self._camera, self._prior) if newest.problem]
 
     def take(self, topic: InputTopic, message: Any) -> None:
         """Take the newest message of a topic; one that cannot be used takes the place of an older good one.
@@ -136,17 +148,15 @@ class Inputs:
         elif topic in (InputTopic.PRIOR, InputTopic.INITIAL_POSE):
             self._set_prior(_Newest(problem=problem))
 
-    def take_answer(self, T_map_camera: np.ndarray, stamp: int, started_from: Prior) -> None:
+    def take_answer(self, answer: Prior, started_from: LocalizerInput) -> None:
         """Go on from an answer, unless a prior came since the one it started from.
 
         Args:
-            T_map_camera: (4, 4).
-            stamp: of its image, in nanoseconds.
-            started_from: the prior that the image was localized with.
+            answer: as a prior.
+            started_from: what its image was localized with.
         """
-        answer = Prior(PriorSource.LAST_ANSWER, stamp, self.policy.map_frame, False, T_map_camera, None)
         with self._prior_lock:
-            if self._prior.value is started_from:
+            if self._prior.value is started_from.newest_prior and not self._prior.problem:
                 self._prior = _Newest(answer)
 
     def forget_after(self, stamp: int) -> None:
@@ -154,13 +164,42 @@ class Inputs:
         self._odometry.forget_after(stamp)
         with self._prior_lock:
             if self._prior.value and self._prior.value.stamp > stamp:
-                self._prior = _Newest(problem=f"time went back: {self._no_prior}")
+                self._prior = _NOTHING
 
     def forget_answer(self) -> None:
-        """Do not go on from the last answer: it is of another map."""
+        """Do not go on from the last answer: it is of another map, or worth nothing any more."""
         with self._prior_lock:
-            if self._prior.value and self._prior.value.source is PriorSource.LAST_ANSWER:
-                self._prior = _Newest(problem=self._no_prior)
+            if self._prior.value and self._prior.value.source.own:
+                self._prior = _NOTHING
+
+    def forget_prior(self) -> None:
+        """Forget all that is known of where the robot is."""
+        self._set_prior(_NOTHING)
+
+    def start_from(self, saved: Prior) -> None:
+        """Look first near a pose of a run before, until a prior comes."""
+        with self._prior_lock:
+            if self._prior is _NOTHING:
+                self._prior = _Newest(saved)
+
+    def has_odometry(self, stamp: int) -> bool:
+        """Return whether odometry says where the robot was at `stamp` (nanoseconds)."""
+        return self._odometry.motion(stamp, stamp) is not None
+
+    def carried_sigma(self) -> float | None:
+        """Return the standard deviation of the last answer's position as odometry has carried it up to now.
+
+        None where no answer counts, or no odometry carries it.
+        """
+        prior, newest = self._prior.value, self._odometry.newest
+        if prior is None or not prior.source.own or not prior.stamp or newest is None:
+            return None
+        travelled = self._odometry.travelled(prior.stamp, newest)
+        return (
+            None
+            if travelled is None
+            else position_sigma(self._grown(prior.covariance, self.policy.growth.by_odometry(travelled)))
+        )
 
     def for_image(self, message: AnyImage, camera: Camera | None = None, prior: Prior | None = None) -> LocalizerInput:
         """Return what to localize an image with.
@@ -168,13 +207,16 @@ class Inputs:
         Args:
             message: the image.
             camera: of the image; None for that of the newest camera_info.
-            prior: where it was taken; None for the newest.
+            prior: where it was taken; None for the newest, if there is one.
 
         Raises:
-            ValueError: the image cannot be decoded, something is missing, of another size, too old, or in a frame from
-                which no way is known.
+            ValueError: the image cannot be decoded, something is missing, of another size, of the future, or in a frame
+                from which no way is known.
         """
-        camera, prior = camera or self._camera.get(), prior or self._prior.get()
+        camera, newest = camera or self._camera.get(), self._prior
+        if prior is None and newest.problem:
+            raise ValueError(newest.problem)
+        prior = prior or newest.value or (self.policy.plane() if self.policy.planar else None)
         width, height = picture_size(message)
         if (camera.width, camera.height) != (width, height):
             raise ValueError(
@@ -182,9 +224,9 @@ class Inputs:
                 "camera_info of this image"
             )
         stamp, frame = nanoseconds(message.header.stamp), message.header.frame_id
-        pose, covariance = self._at(prior, stamp, frame)
+        pose, covariance = (None, None) if prior is None else self._at(prior, stamp, frame)
         camera = replace(camera, readout=self._readout(stamp, frame, height))
-        return LocalizerInput(decode_picture(message), camera, pose, covariance, prior)
+        return LocalizerInput(decode_picture(message), camera, pose, covariance, prior, newest.value)
 
     def _set_prior(self, newest: _Newest[Prior]) -> None:
         with self._prior_lock:
@@ -229,14 +271,22 @@ class Inputs:
         if not stamp or not prior.stamp:
             return pose, covariance
         age = 1e-9 * (stamp - prior.stamp)
-        motion = self._odometry.motion(prior.stamp, stamp) if abs(age) <= policy.odometry_max_age else None
-        if motion is not None:
+        carried = abs(age) <= policy.odometry_max_age
+        motion = self._odometry.motion(prior.stamp, stamp) if carried else None
+        travelled = self._odometry.travelled(prior.stamp, stamp) if carried else None
+        if motion is not None and travelled is not None:
             T_body_camera = self._lookup(self._odometry_frame, camera_frame, stamp)
-            return pose @ invert(T_body_camera) @ motion @ T_body_camera, covariance
-        if policy.max_age and abs(age) > policy.max_age:
-            advice = "send a newer one" if age > 0 else "do the clocks that stamp them agree (use_sim_time)?"
+            pose = pose @ invert(T_body_camera) @ motion @ T_body_camera
+            return pose, self._grown(covariance, policy.growth.by_odometry(travelled))
+        if not prior.source.own and policy.max_age and -age > policy.max_age:
             raise ValueError(
-                f"{prior.source.value} is {abs(age):.1f} s {'older' if age > 0 else 'newer'} than the image (at most "
-                f"{policy.max_age:g}, prior_max_age): {advice}"
+                f"{prior.source.value} is {-age:.1f} s newer than the image (at most {policy.max_age:g}, "
+                "prior_max_age): do the clocks that stamp them agree (use_sim_time)?"
             )
+        if prior.source.own or (policy.max_age and age > policy.max_age):
+            covariance = self._grown(covariance, policy.growth.by_time(age))
         return pose, covariance
+
+    def _grown(self, covariance: np.ndarray | None, growth: Growth) -> np.ndarray:
+        known = self.policy.default_covariance() if covariance is None else covariance
+        return growth.added_to(known, self.policy.planar)

@@ -7,7 +7,8 @@ from threading import Lock
 
 import numpy as np
 
-from gsfeatloc_ros.common.geometry import interpolate, invert, so3_log
+from gsfeatloc_ros.common.geometry import interpolate, invert, so3_log, translation_error
+from gsfeatloc_ros.ros_io.growth import Travelled
 
 # Nanoseconds. Farther than this from a message the odometry does not say where the robot was.
 _MAX_DISTANCE = 200_000_000
@@ -27,26 +28,35 @@ class OdometryBuffer:
         self._lock = Lock()
         self._stamps: list[int] = []
         self._poses: list[np.ndarray] = []
+        # How long the way was up to each pose, from one that may be forgotten: distance, turn in radians.
+        self._way: list[np.ndarray] = []
+
+    @property
+    def newest(self) -> int | None:
+        """Stamp of the newest pose in nanoseconds; None where there is none."""
+        with self._lock:
+            return self._stamps[-1] if self._stamps else None
 
     def add(self, stamp: int, pose: np.ndarray) -> None:
         """Take the pose T_odom_body (4, 4) at `stamp` (nanoseconds); one that comes out of order is left out."""
         with self._lock:
             if self._stamps and stamp < self._stamps[-1] - _MAX_DISORDER:
-                self._stamps, self._poses = [], []
+                self._stamps, self._poses, self._way = [], [], []
             if self._stamps and stamp <= self._stamps[-1]:
                 return
+            self._way.append(self._way[-1] + _step(self._poses[-1], pose) if self._way else np.zeros(2))
             self._stamps.append(stamp)
             self._poses.append(pose)
             # Seldom, for it moves all that stays.
             if self._stamps[0] < stamp - 2 * self._kept:
                 first = bisect_left(self._stamps, stamp - self._kept)
-                del self._stamps[:first], self._poses[:first]
+                del self._stamps[:first], self._poses[:first], self._way[:first]
 
     def forget_after(self, stamp: int) -> None:
         """Forget what is stamped later than `stamp` (nanoseconds)."""
         with self._lock:
             end = bisect_left(self._stamps, stamp)
-            del self._stamps[end:], self._poses[end:]
+            del self._stamps[end:], self._poses[end:], self._way[end:]
 
     def motion(self, start: int, end: int) -> np.ndarray | None:
         """Return the pose (4, 4) of the body at `end` in the body's frame at `start` (nanoseconds).
@@ -70,6 +80,16 @@ class OdometryBuffer:
             seconds = 1e-9 * (self._stamps[after] - self._stamps[after - 1])
         return np.concatenate([motion[:3, 3], so3_log(motion[:3, :3])]) / seconds
 
+    def travelled(self, start: int, end: int) -> Travelled | None:
+        """Return how long the way was between two times (nanoseconds), to the next messages; None as of `motion`."""
+        with self._lock:
+            if self._at(start) is None or self._at(end) is None:
+                return None
+            last = len(self._stamps) - 1
+            first, second = (self._way[min(bisect_left(self._stamps, stamp), last)] for stamp in (start, end))
+        distance, turn = np.abs(second - first).tolist()
+        return Travelled(distance, turn)
+
     def _at(self, stamp: int) -> np.ndarray | None:
         after = bisect_left(self._stamps, stamp)
         if 0 < after < len(self._stamps):
@@ -81,3 +101,8 @@ class OdometryBuffer:
         if nearest is None or abs(self._stamps[nearest] - stamp) > _MAX_DISTANCE:
             return None
         return self._poses[nearest]
+
+
+def _step(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return distance and turn in radians (2,) from one pose (4, 4) to another."""
+    return np.array([translation_error(a, b), np.linalg.norm(so3_log(a[:3, :3].T @ b[:3, :3]))])

@@ -14,6 +14,8 @@ class OutcomeStatus(Enum):
     LOCALIZED = "localized"
     REJECTED = "rejected"
     FAILED = "failed"
+    AMBIGUOUS = "ambiguous"
+    UNCONFIRMED = "unconfirmed"
     REFUSED = "refused"
     ERROR = "error"
 
@@ -23,7 +25,8 @@ class Outcome:
     """What came of an image.
 
     Attributes:
-        status: REFUSED: the image could not be tried. ERROR: a bug met on it, or no memory. Otherwise the estimate's.
+        status: UNCONFIRMED: a pose was found that another image has to confirm. REFUSED: the image could not be tried.
+            ERROR: a bug met on it, or no memory. Otherwise the estimate's.
         reason: one sentence.
         estimate: None if the image could not be tried.
     """
@@ -36,6 +39,11 @@ class Outcome:
     def of(estimate: Estimate) -> Outcome:
         """Return the outcome that an estimate is."""
         return Outcome(OutcomeStatus(estimate.status.value), estimate.reason, estimate)
+
+    @staticmethod
+    def unconfirmed(estimate: Estimate, note: str) -> Outcome:
+        """Return the outcome of an image whose answer another one has to confirm; the note says why."""
+        return Outcome(OutcomeStatus.UNCONFIRMED, f"{note}: {estimate.reason}", estimate)
 
     @staticmethod
     def refused(reason: object) -> Outcome:

@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
 
 import numpy as np
 
 from gsfeatloc_ros.ros_io.decode import decode_covariance, decode_pose, nanoseconds
+from gsfeatloc_ros.ros_io.growth import GrowthOptions
 from gsfeatloc_ros.ros_io.message_types import AnyPose
+
+# Variance of a coordinate of which nothing is known, in square map units or radians.
+_UNKNOWN = 1e6
+# Share of the usual deviations of a prior by which a planar robot may leave its plane: ramps, soft wheels.
+_SHARE_OFF_PLANE = 0.2
+# Radians by which a robot may have turned since its pose was saved (standard deviation).
+_SAVED_ROTATION = np.pi / 3
 
 
 class PriorSource(Enum):
@@ -18,19 +26,31 @@ class PriorSource(Enum):
     INITIAL_POSE = "initialpose"
     LAST_ANSWER = "last answer"
     REQUEST = "request's prior"
+    UNCONFIRMED = "unconfirmed answer"
+    SAVED = "saved pose"
+    PLANE = "plane"
+
+    @property
+    def own(self) -> bool:
+        """Whether it is an answer of the localizer's own; otherwise it came from outside, or from nowhere."""
+        return self in (PriorSource.LAST_ANSWER, PriorSource.UNCONFIRMED, PriorSource.SAVED)
 
 
 @dataclass(frozen=True)
 class PriorPolicy:
-    """What priors are poses of, and how old they may be.
+    """What priors are poses of, and how uncertain they become with time.
 
     Attributes:
         map_frame: name of the map's frame.
         base_frame: name of the robot base's frame.
         of_base: whether priors are poses of the base; otherwise of the camera's optical frame.
-        max_age: seconds by which a prior may be older or newer than the image if no odometry carries it to the image's
-            time; 0 for no limit.
+        max_age: seconds for which a prior from outside holds as it is if no odometry carries it to the image's time; 0
+            for ever. An older one becomes uncertain. None may be newer than the image by more.
         odometry_max_age: seconds over which odometry may carry it.
+        translation_sigma, rotation_sigma: standard deviations, in map units and degrees, of a prior whose covariance is
+            not known.
+        growth: how fast it becomes uncertain.
+        planar: whether the base stays on the plane z = 0 of the map, and upright.
     """
 
     map_frame: str = "map"
@@ -38,6 +58,25 @@ class PriorPolicy:
     of_base: bool = False
     max_age: float = 10.0
     odometry_max_age: float = 60.0
+    translation_sigma: float = 0.5
+    rotation_sigma: float = 15.0
+    growth: GrowthOptions = field(default_factory=GrowthOptions)
+    planar: bool = False
+
+    def default_covariance(self) -> np.ndarray:
+        """Return the covariance (6, 6) of a prior that comes without one."""
+        return np.diag(np.square([self.translation_sigma] * 3 + [np.radians(self.rotation_sigma)] * 3))
+
+    def plane(self) -> Prior:
+        """Return the prior of a base that stands somewhere on the plane z = 0 of the map, upright."""
+        variances = self.default_covariance().diagonal() * _SHARE_OFF_PLANE**2
+        variances[[0, 1, 5]] = _UNKNOWN
+        return Prior(PriorSource.PLANE, 0, self.map_frame, True, np.eye(4), np.diag(variances))
+
+    def saved(self, T_map_camera: np.ndarray, sigma: float) -> Prior:
+        """Return the prior that a pose (4, 4) of a run before is; the robot may be `sigma` map units away from it."""
+        variances = np.square([sigma] * 3 + [_SAVED_ROTATION] * 3)
+        return Prior(PriorSource.SAVED, 0, self.map_frame, False, T_map_camera, np.diag(variances))
 
 
 @dataclass(frozen=True, eq=False)

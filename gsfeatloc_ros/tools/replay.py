@@ -180,7 +180,8 @@ def _parser() -> argparse.ArgumentParser:
         type=number(float, 0),
         default=PriorPolicy().max_age,
         metavar="SECONDS",
-        help="by which a prior may be older or newer than an image; 0 for no limit (default: %(default)s)",
+        help="for which a prior holds as it is; it may be newer than an image by no more; 0 for no limit (default: "
+        "%(default)s)",
     )
     parser.add_argument("--rectified", action="store_true", help="the images are rectified, as image.rectified")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new or empty folder")

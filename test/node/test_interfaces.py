@@ -22,7 +22,7 @@ from gsfeatloc_ros.client.messages import rgb_image
 from gsfeatloc_ros.localize.protection import RISK
 
 ROOT = Path(__file__).parents[2]
-STATUSES = {"LOCALIZED": 0, "REJECTED": 1, "FAILED": 2, "REFUSED": 3, "ERROR": 4}
+STATUSES = {"LOCALIZED": 0, "REJECTED": 1, "FAILED": 2, "REFUSED": 3, "ERROR": 4, "AMBIGUOUS": 5}
 
 
 def test_request_has_the_fields():
@@ -31,6 +31,8 @@ def test_request_has_the_fields():
         "camera_info": "sensor_msgs/CameraInfo",
         "has_prior": "boolean",
         "prior": "geometry_msgs/PoseWithCovarianceStamped",
+        "max_seconds": "double",
+        "forget": "boolean",
     }
 
 
@@ -39,6 +41,7 @@ def test_response_has_the_fields():
         "status": "uint8",
         "reason": "string",
         "pose": "geometry_msgs/PoseWithCovarianceStamped",
+        "candidates": "geometry_msgs/PoseArray",
         "probability_wrong": "double",
         "protection_radius": "double",
         "protection_angle": "double",
@@ -61,9 +64,11 @@ def test_protection_level_has_the_fields():
     assert ProtectionLevel().risk == RISK
 
 
-def test_empty_request_has_no_prior():
+def test_empty_request_has_no_prior_and_heals_the_stream():
     request = deserialize_message(serialize_message(LocalizeImage.Request()), LocalizeImage.Request)
     assert not request.has_prior
+    assert not request.forget
+    assert request.max_seconds == 0
     assert len(request.image.data) == 0
     assert not np.any(request.prior.pose.covariance)
 

@@ -34,13 +34,11 @@ def check_refusal(client: Client, localizer, image: Image, says: str) -> None:
     localizer.wait_for_output(rf"\[WARN\].*{says}")
 
 
-def test_no_prior_yet(room_map_file, good_info, good_prior, photo):
-    with (
-        running_localizer(map__path=room_map_file, matcher__name="sift") as localizer,
-        connected_client() as client,
-    ):
+def test_neither_a_prior_nor_a_view_index(room_map_file, good_info, good_prior, photo, tmp_path):
+    parameters = {"map__path": room_map_file, "index__build": False, "index__path": tmp_path / "none"}
+    with running_localizer(**parameters) as localizer, connected_client() as client:
         client.send_camera_info(good_info)
-        check_refusal(client, localizer, rgb_image(photo.image), "no prior yet: publish .* on /prior")
+        check_refusal(client, localizer, rgb_image(photo.image), "index")
         client.send_prior(good_prior)
         assert_answer(client, photo)
 

@@ -11,6 +11,7 @@ import pytest
 from geometry_msgs.msg import TransformStamped
 from gsfeatloc_interfaces.msg import ProtectionLevel
 from node_harness import assert_close, assert_start_fails, connected_client, running_localizer
+from std_srvs.srv import Empty
 from transforms import transform_stamped
 
 from gsfeatloc_ros.client.messages import (
@@ -55,6 +56,20 @@ def tell_where_the_camera_is(client, T_base_camera: np.ndarray) -> tf2_ros.Stati
     return broadcaster
 
 
+def of_odom(heard: list[TFMessage]) -> list[TransformStamped]:
+    """Return the transforms from the map to odom that were heard."""
+    return [t for message in heard for t in message.transforms if t.child_frame_id == "odom"]
+
+
+def told(heard: list[TFMessage]) -> list[np.ndarray]:
+    """Return them as poses (4, 4)."""
+    poses = []
+    for t in of_odom(heard):
+        p, q = t.transform.translation, t.transform.rotation
+        poses.append(make_pose(matrix_from_quaternion([q.x, q.y, q.z, q.w]), [p.x, p.y, p.z]))
+    return poses
+
+
 def test_priors_and_answers_of_the_base_and_tf_from_the_map_to_odom(tf, room_map_file, room_camera, photo, T_map_base):
     off = invert(photo.T_map_camera) @ photo.T_map_camera_prior
     T_base_camera = invert(T_map_base) @ photo.T_map_camera
@@ -81,21 +96,62 @@ def test_priors_and_answers_of_the_base_and_tf_from_the_map_to_odom(tf, room_map
         assert levels[-1].radius == pytest.approx(protection_level(covariance).radius)
 
         # It is told again and again, with stamps that go on, so that it can be used between answers.
-        def told() -> list[TransformStamped]:
-            return [t for message in heard for t in message.transforms if t.child_frame_id == "odom"]
-
-        assert client.spin_until(lambda: len(told()) > 5)
-        last = told()[-1]
-        assert last.header.frame_id == "map"
-        stamps = [t.header.stamp.sec + 1e-9 * t.header.stamp.nanosec for t in told()]
+        assert client.spin_until(lambda: len(of_odom(heard)) > 5)
+        assert of_odom(heard)[-1].header.frame_id == "map"
+        stamps = [t.header.stamp.sec + 1e-9 * t.header.stamp.nanosec for t in of_odom(heard)]
         assert stamps == sorted(stamps)
         assert stamps[-1] > stamps[0]
-        t, q = last.transform.translation, last.transform.rotation
-        found = make_pose(matrix_from_quaternion([q.x, q.y, q.z, q.w]), [t.x, t.y, t.z])
+        found = told(heard)[-1]
         # The base is where the pose says.
         np.testing.assert_allclose(found @ T_ODOM_BASE, pose_matrix(pose), atol=1e-9)
         np.testing.assert_allclose(found, T_map_odom, atol=0.1)
         client.node.destroy_publisher(static)  # kept until here: static transforms come from who told them
+
+
+def test_a_flat_transform_that_ends_when_the_robot_is_lost(tf, room_map_file, room_camera, photo, T_map_base):
+    """The base is told to be higher and tilted: the transform is flat all the same, and right where the robot is."""
+    tilted = T_map_base @ make_pose(so3_exp(np.array([0.02, 0.01, 0.0])), [0.0, 0.0, 0.05])
+    T_base_camera = invert(tilted) @ photo.T_map_camera
+    parameters = {"map__path": room_map_file, "planar_tf": True} | ALIGNED | {"prior_frame": "camera"}
+    with running_localizer(**parameters) as process, connected_client() as client:
+        static = tell_where_the_camera_is(client, T_base_camera)
+        moving, heard = tf2_ros.TransformBroadcaster(client.node), client.listen(TFMessage, "/tf")
+        client.send_camera_info(camera_info_of(room_camera))
+        client.send_prior(pose_stamped(photo.T_map_camera_prior))
+        image = rgb_image(photo.image)
+        image.header.stamp = client.next_stamp()
+        moving.sendTransform(transform_stamped("odom", "base_link", T_ODOM_BASE, image.header.stamp))
+        client.spin(0.5)
+        client.send_image(image)
+        assert client.spin_until(lambda: len(told(heard)) > 5), process.output
+        flat = told(heard)[-1]
+        np.testing.assert_allclose(flat[2], [0, 0, 1, 0], atol=1e-9)
+        np.testing.assert_allclose((flat @ T_ODOM_BASE)[:2, 3], T_map_base[:2, 3], atol=0.02)
+        client.call(Empty, "reinitialize_global_localization", Empty.Request())
+        client.spin(0.5)
+        count = len(told(heard))
+        client.spin(1.0)
+        assert len(told(heard)) == count
+        process.wait_for_output("lost: asked for by reinitialize_global_localization", 5.0)
+        client.node.destroy_publisher(static)
+
+
+def test_of_a_planar_robot_only_x_y_and_yaw_are_unknown(tf, room_map_file, room_camera, photo, T_map_base):
+    parameters = {"map__path": room_map_file, "map__aligned": True, "search__planar": True}
+    with running_localizer(**parameters) as process, connected_client() as client:
+        process.wait_for_index()
+        static = tell_where_the_camera_is(client, invert(T_map_base) @ photo.T_map_camera)
+        client.send_camera_info(camera_info_of(room_camera))
+        image = rgb_image(photo.image)
+        answer = client.attempt(image)
+        assert answer.ok, f"{answer.reason}\n{process.output}"
+        assert answer.values["prior"] == "plane"
+        assert_close(client.pose_of(image), photo.T_map_camera)
+        client.node.destroy_publisher(static)
+
+
+def test_a_map_that_nobody_aligned_has_no_floor(room_map_file):
+    assert_start_fails("search.planar needs map.aligned", map__path=room_map_file, search__planar=True)
 
 
 def test_initialpose_as_rviz_sends_it(tf, room_map_file, room_camera, photo, T_map_base):

@@ -34,6 +34,7 @@ END_TIMEOUT = 8.0
 @pytest.fixture(scope="module")
 def localizer(room_map_file):
     with running_localizer(map__path=room_map_file, matcher__name="sift", image__timeout=1.0) as process:
+        process.wait_for_index()
         yield process
 
 
@@ -105,14 +106,12 @@ def test_publisher_is_killed_and_another_one_starts(client, room_camera, photo, 
 
 @pytest.mark.parametrize("jump", [[100.0, 0.0, 0.0], [0.0, -100.0, 0.0], [0.0, 0.0, 100.0]])
 def test_prior_jumps_100_m(client, room_camera, photo, jump):
-    image = rgb_image(photo.image)
+    """It says where to look first, and no more."""
     send_inputs(client, room_camera, photo)
     assert_answer(client, photo)
     far = photo.T_map_camera_prior.copy()
     far[:3, 3] += jump
     client.send_prior(pose_stamped(far))
-    assert_no_answer(client, image, "photo and renders at the prior and in .* have nothing in common|not believed")
-    client.send_prior(pose_stamped(photo.T_map_camera_prior))
     assert_answer(client, photo)
 
 
@@ -121,12 +120,9 @@ def test_prior_stale_or_of_the_future(client, room_camera, photo):
     send_inputs(client, room_camera, photo)
     client.send_prior(stamped(pose_stamped(photo.T_map_camera_prior), 100_000))
     assert_answer(client, photo, 100_009)
-    assert_no_answer(
-        client,
-        image,
-        r"prior is 11\.0 s older than the image .*prior_max_age.*send a newer one",
-        100_011,
-    )
+    # An old one means a wider search.
+    assert_answer(client, photo, 100_011)
+    assert float(client.diagnostics[-1].values["prior_sigma"]) > 10.0
     assert_no_answer(client, image, r"prior is 11\.0 s newer than the image .*prior_max_age.*clocks", 99_989)
     assert_answer(client, photo, 99_991)
 
@@ -142,4 +138,5 @@ def test_stamps_go_back(client, room_camera, photo):
     assert_answer(client, photo, 200_000)
     # Late, and out of order.
     client.send_prior(stamped(prior, 199_900))
-    assert_no_answer(client, image, r"prior is 101\.0 s older than the image .*prior_max_age", 200_001)
+    assert_answer(client, photo, 200_001)
+    assert float(client.diagnostics[-1].values["prior_sigma"]) > 99.0

@@ -22,10 +22,11 @@ def send_good(client: Client, camera, photo) -> None:
     assert_answer(client, photo)
 
 
-def test_signal_in_the_middle_of_a_localization(room_map_file, room_camera, room_photos):
-    """One of many seconds: all of a wide prior is searched for a photo that shows nothing of the map."""
+def test_signal_in_the_middle_of_a_localization(room_map_file, room_camera, room_photos, tmp_path):
+    """One of many seconds: without an index all of a wide prior is searched for a photo of nothing in the map."""
     photo = room_photos[0]
-    parameters = {"map__path": room_map_file, "matcher__name": "sift", "localizer__max_views": 1000}
+    parameters = {"map__path": room_map_file, "localizer__max_views": 1000}
+    parameters |= {"index__build": False, "index__path": tmp_path / "none"}
     with running_localizer(**parameters) as localizer, connected_client() as client:
         client.send_camera_info(camera_info_of(room_camera))
         wide = pose_with_covariance(photo.T_map_camera, np.diag([1.0, 1.0, 1.0, 10.0, 10.0, 10.0]))

@@ -14,6 +14,7 @@ import rclpy
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
+from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import SetParametersResult
 from rcl_interfaces.srv import GetParameters, SetParameters
 from rclpy.parameter import Parameter, parameter_value_to_python
@@ -60,6 +61,10 @@ class NodeProcess(process.LocalizerProcess):
 
     def wait_for_output(self, pattern: str, timeout: float = TIMEOUT) -> None:
         super().wait_for_output(pattern, timeout)
+
+    def wait_for_index(self) -> None:
+        """Wait until it finds images without a prior."""
+        super().wait_for_output("the view index is ready", process.START_TIMEOUT)
 
     def wait(self, timeout: float = TIMEOUT) -> int:
         return super().wait(timeout)
@@ -131,6 +136,9 @@ class Client(ClientNode):
         # What the localizer said of its health, and of its map.
         self.health: list[Diagnostic] = []
         self.maps: list[Diagnostic] = []
+        # And of the state, and the view index.
+        self.states: list[Diagnostic] = []
+        self.index: list[Diagnostic] = []
         self._publishers: dict[str, rclpy.publisher.Publisher] = {}
         self._services: dict[str, rclpy.client.Client] = {}
         image = (Image, "image") if transport == "raw" else (CompressedImage, "image/compressed")
@@ -273,7 +281,13 @@ class Client(ClientNode):
         self.poses[stamp_of(message)] = message
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
-        lists = {"localization": self.diagnostics, "health": self.health, "map": self.maps}
+        lists = {
+            "localization": self.diagnostics,
+            "health": self.health,
+            "map": self.maps,
+            "state": self.states,
+            "index": self.index,
+        }
         for diagnostic in read_diagnostics(message):
             if diagnostic.name == f"localizer: {diagnostic.part}":
                 lists[diagnostic.part].append(diagnostic)
@@ -294,6 +308,13 @@ def compressed_image(rgb: np.ndarray, extension: str) -> CompressedImage:
     """Return pixels (H, W, 3) uint8 RGB as an image of a format such as png."""
     encoded = cv2.imencode(f".{extension}", rgb[:, :, ::-1])[1]
     return CompressedImage(header=Header(frame_id=CAMERA_FRAME), format=extension, data=encoded.tobytes())
+
+
+def odometry(T_odom_body: np.ndarray, stamp: Time, child: str) -> Odometry:
+    """Return the pose (4, 4) of a body in the odometry's frame as a message."""
+    message = Odometry(header=Header(stamp=stamp, frame_id="odom"), child_frame_id=child)
+    message.pose.pose = pose_stamped(T_odom_body).pose
+    return message
 
 
 def stamped(message: object, seconds: int) -> object:

@@ -27,3 +27,11 @@ def test_a_bug_is_an_error_and_no_refusal():
     error = Outcome.error(MemoryError("no room"))
     assert (error.status, error.reason, error.estimate) == (OutcomeStatus.ERROR, "MemoryError: no room", None)
     assert not error.localized
+
+
+def test_an_answer_to_be_confirmed_is_none_yet():
+    estimate = Estimate(Status.LOCALIZED, "30 inliers", np.eye(4), np.eye(6))
+    unconfirmed = Outcome.unconfirmed(estimate, "the next image has to agree")
+    assert (unconfirmed.status, unconfirmed.estimate) == (OutcomeStatus.UNCONFIRMED, estimate)
+    assert unconfirmed.reason == "the next image has to agree: 30 inliers"
+    assert not unconfirmed.localized

@@ -16,7 +16,8 @@ from gsfeatloc_ros.common.geometry import quaternion_from_matrix, so3_exp
 from gsfeatloc_ros.localize.options import LocalizerOptions
 from gsfeatloc_ros.localize.settings import MapSettings
 from gsfeatloc_ros.maps import Similarity
-from gsfeatloc_ros.node.settings import PARAMETERS, ImageSettings, NodeSettings, Settings
+from gsfeatloc_ros.node.settings import PARAMETERS, ImageSettings, NodeSettings, RecoverySettings, Settings
+from gsfeatloc_ros.ros_io.growth import GrowthOptions
 from gsfeatloc_ros.ros_io.prior import PriorPolicy
 from gsfeatloc_ros.tools.parameters import main, page_text, yaml_text
 
@@ -115,11 +116,13 @@ def test_what_is_no_parameter_does_not_count():
 def test_options_of_the_localizer_are_parameters_but_for_those_of_experts():
     options = LocalizerOptions()
     nested = [getattr(options, name) for name in ("pose", "limits", "lift")]
-    names = {item.name for settings in (options, *nested) for item in fields(settings)} - {"pose", "limits", "lift"}
+    groups = {"pose", "limits", "lift", "search"}
+    names = {item.name for settings in (options, *nested) for item in fields(settings)} - groups
     parameters = {name.removeprefix("localizer.") for name in DEFAULTS if name.startswith("localizer.")}
     experts = {"cauchy_scale", "shared_error", "shared_share", "min_alpha", "max_depth_step", "max_depth_spread"}
     assert names - parameters == experts
     assert parameters <= names
+    assert {f"search.{item.name}" for item in fields(options.search)} <= DEFAULTS.keys()
 
 
 def test_the_page_names_those_that_have_no_effect_any_more():
@@ -134,6 +137,16 @@ def test_policy_on_priors_follows_the_settings():
     node = NodeSettings(prior_frame="base", base_frame="body", prior_max_age=2.0, odometry_max_age=3.0)
     settings = replace(Settings(), node=node, image=ImageSettings(timeout=1.0))
     assert settings.prior_policy() == PriorPolicy("map", "body", True, 2.0, 3.0)
+    growth = GrowthOptions(max_speed=2.0)
+    settings = replace(Settings(), recovery=RecoverySettings(planar=True, growth=growth))
+    assert settings.prior_policy() == PriorPolicy(planar=True, growth=growth)
+
+
+def test_a_prior_of_which_nothing_is_known_is_as_uncertain_for_the_node_as_for_the_localizer():
+    options = LocalizerOptions(prior_translation=2.0, prior_rotation=40.0)
+    policy = replace(Settings(), localizer=options).prior_policy()
+    np.testing.assert_array_equal(policy.default_covariance(), options.prior_covariance())
+    np.testing.assert_array_equal(PriorPolicy().default_covariance(), LocalizerOptions().prior_covariance())
 
 
 # The map's frame.

@@ -1,0 +1,94 @@
+"""Follows the robot from image to image: what each starts from, and what becomes of its answer."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gsfeatloc_ros.common.camera import Camera
+from gsfeatloc_ros.ros_io.decode import nanoseconds
+from gsfeatloc_ros.ros_io.inputs import Inputs, LocalizerInput
+from gsfeatloc_ros.ros_io.message_types import AnyImage, Header
+from gsfeatloc_ros.ros_io.prior import Prior, PriorSource
+from gsfeatloc_ros.ros_io.state import Attempt, Decision, Judgement, LocalizationState, is_unattested
+
+
+class Follower:
+    """Chooses what images start from, and judges answers; for the worker's thread, `lose` for any.
+
+    Args:
+        inputs: what images are localized with.
+        state: where the robot stands.
+        track: whether the next image goes on from an answer.
+
+    Attributes:
+        images_come: whether they come by themselves: then one may confirm another.
+    """
+
+    def __init__(self, inputs: Inputs, state: LocalizationState, track: bool) -> None:
+        self._inputs, self.state, self._track = inputs, state, track
+        self.images_come = True
+        # Of the images that come by themselves.
+        self._camera_frame: str | None = None
+
+    def for_image(self, message: AnyImage, camera: Camera | None = None, prior: Prior | None = None) -> LocalizerInput:
+        """Return what to localize an image with; arguments and errors as of `Inputs.for_image`."""
+        query = self._inputs.for_image(message, camera, prior)
+        if self.state.outgrown(query.source, query.prior_covariance):
+            self._inputs.forget_answer()
+            query = self._inputs.for_image(message, camera, prior)
+        return query
+
+    def take(self, query: LocalizerInput, header: Header, T_map_camera: np.ndarray | None) -> Judgement:
+        """Take what came of an image that came by itself, and return what is to be done.
+
+        Args:
+            query: what the image was localized with.
+            header: of the image.
+            T_map_camera: (4, 4) the answer; None for none.
+        """
+        self._camera_frame = header.frame_id
+        attempt = Attempt(
+            query.source, query.T_map_camera_prior, query.prior_covariance, T_map_camera, self._confirmable(header)
+        )
+        judgement = self.state.take(attempt)
+        if judgement.decision is Decision.FORGET:
+            self._inputs.forget_answer()
+        elif T_map_camera is not None:
+            awaited = judgement.decision is Decision.AWAIT
+            self._go_on(query, header, T_map_camera, PriorSource.UNCONFIRMED if awaited else PriorSource.LAST_ANSWER)
+        return judgement
+
+    def take_requested(self, query: LocalizerInput, header: Header, T_map_camera: np.ndarray) -> None:
+        """Let the images that come by themselves go on from the answer to one that came with a request.
+
+        They do not if it is older than what they have, or of another camera.
+        """
+        newest, stamp = query.newest_prior, nanoseconds(header.stamp)
+        if newest is not None and newest.source.own and newest.stamp > stamp:
+            return
+        if self._camera_frame not in (None, header.frame_id):
+            return
+        unconfirmed = is_unattested(query.source) and self._confirmable(header)
+        self._go_on(query, header, T_map_camera, PriorSource.UNCONFIRMED if unconfirmed else PriorSource.LAST_ANSWER)
+
+    def lose(self, reason: str, *, with_priors: bool) -> None:
+        """Be lost, for this reason: forget the last answer, and what came from outside too where that is said."""
+        if with_priors:
+            self._inputs.forget_prior()
+        else:
+            self._inputs.forget_answer()
+        self.state.reset(reason)
+
+    def pass_time(self, images_wanted: bool) -> None:
+        """Note that time has passed, perhaps without images, though they may be wanted."""
+        self.state.pass_time(self._inputs.carried_sigma(), images_wanted)
+
+    def _confirmable(self, header: Header) -> bool:
+        stamp = nanoseconds(header.stamp)
+        return self._track and self.images_come and stamp > 0 and self._inputs.has_odometry(stamp)
+
+    def _go_on(self, query: LocalizerInput, header: Header, T_map_camera: np.ndarray, source: PriorSource) -> None:
+        if self._track:
+            frame = self._inputs.policy.map_frame
+            answer = Prior(source, nanoseconds(header.stamp), frame, False, T_map_camera, None)
+            self._inputs.take_answer(answer, query)
