@@ -89,10 +89,10 @@ def seen_cells(render: Render, camera: Camera, T_map_camera: np.ndarray, near: f
         return set()
     rays = camera.rays(np.column_stack([columns, rows]).astype(np.float64)[surface])
     points = (rays * depth[surface, None]) @ T_map_camera[:3, :3].T + T_map_camera[:3, 3]
-    return _cells(points, T_map_camera[:3, 3])
+    return cells(points, T_map_camera[:3, 3])
 
 
-def _cells(points: np.ndarray, centre: np.ndarray) -> set[int]:
+def cells(points: np.ndarray, centre: np.ndarray) -> set[int]:
     """Return the cells, numbered by a hash, of points (N, 3) seen from a `centre` (3,)."""
     offsets = points - centre
     distances = np.linalg.norm(offsets, axis=1)

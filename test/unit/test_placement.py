@@ -9,70 +9,72 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 from small_maps import small_camera
 
 from gsfeatloc_ros.common.geometry import make_pose, so3_exp, transform
-from gsfeatloc_ros.index.placement import cells, cover, radius, random_poses, seen_cells
+from gsfeatloc_ros.index.placement import cells, cover, overlap, radius, random_poses, seen_cells, sees
 from gsfeatloc_ros.render import Render
 
 POSE = make_pose(so3_exp(np.array([0.3, -0.2, 1.0])), np.array([1.0, 2.0, 3.0]))
 CLOUD = np.random.default_rng(0).uniform([-3, -2, 0], [3, 2, 1], (500, 3))
 
 
-def shown(views: list[set[int]], chosen: list[int]) -> int:
-    return len(set().union(*(views[view] for view in chosen)))
+some_worth = arrays(np.float32, st.tuples(st.integers(1, 5), st.integers(0, 6)), elements=st.integers(0, 4).map(float))
+
+
+def found(worth: np.ndarray, chosen: list[int]) -> float:
+    """What the photos find in the views that were chosen."""
+    return float(worth[:, chosen].max(axis=1, initial=0).sum())
+
+
+@given(worth=some_worth, count=st.integers(0, 4))
+def test_chosen_views_suit_the_photos_nearly_as_well_as_the_best_choice(worth, count) -> None:
+    chosen = cover(worth, count)
+    assert len(chosen) == len(set(chosen)) <= count
+    views = range(worth.shape[1])
+    best = max(found(worth, list(choice)) for choice in itertools.combinations(views, min(count, len(views))))
+    assert best >= found(worth, chosen) >= (1 - 1 / math.e) * best
+
+
+@given(worth=some_worth, count=st.integers(0, 4))
+def test_each_chosen_view_is_the_one_that_adds_most(worth, count) -> None:
+    before: list[int] = []
+    for view in cover(worth, count):
+        gains = [found(worth, [*before, other]) - found(worth, before) for other in range(worth.shape[1])]
+        assert gains[view] == max(gains) > 0
+        before.append(view)
 
 
 some_views = st.lists(st.sets(st.integers(0, 12), max_size=6), max_size=7)
 
 
-@given(views=some_views, count=st.integers(0, 4))
-def test_chosen_views_show_nearly_as_much_as_the_best_choice(views, count) -> None:
-    chosen = cover(views, count)
-    assert len(chosen) == len(set(chosen)) <= count
-    best = max(
-        shown(views, list(choice)) for choice in itertools.combinations(range(len(views)), min(count, len(views)))
-    )
-    assert best >= shown(views, chosen) >= (1 - 1 / math.e) * best
-
-
-@given(views=some_views, count=st.integers(0, 4))
-def test_each_chosen_view_shows_most_of_what_those_before_do_not(views, count) -> None:
-    covered: set[int] = set()
-    for view in cover(views, count):
-        gain = len(views[view] - covered)
-        assert gain == max(len(other - covered) for other in views) > 0
-        covered |= views[view]
-
-
-@given(views=some_views, count=st.integers(0, 4), data=st.data())
-def test_others_are_chosen_only_when_the_first_show_nothing_more(views, count, data) -> None:
-    first = data.draw(st.integers(0, len(views)))
-    chosen = cover(views, count, first)
-    preferred = cover(views[:first], count)
-    assert chosen[: len(preferred)] == preferred
-    assert all(view >= first for view in chosen[len(preferred) :])
+@given(photos=some_views, views=some_views)
+def test_overlap_is_the_share_of_a_photo_that_a_view_shows(photos, views) -> None:
+    expected = [[len(photo & view) / max(len(photo), 1) for view in views] for photo in photos]
+    np.testing.assert_allclose(overlap(photos, views), np.reshape(expected, (len(photos), len(views))), rtol=1e-6)
 
 
 def test_nothing_is_chosen_of_nothing() -> None:
-    assert cover([], 5) == []
-    assert cover([set(), set()], 5) == []
+    assert cover(np.zeros((0, 0)), 5) == []
+    assert cover(np.zeros((3, 2)), 5) == []
 
 
 @settings(max_examples=20)
 @given(seed=st.integers(0, 2**32 - 1), shift=st.floats(-1e3, 1e3), scale=st.floats(1e-3, 1e3))
 def test_random_poses_aim_at_a_point(seed: int, shift: float, scale: float) -> None:
     points = shift + scale * CLOUD
-    for pose in random_poses(points, 20, np.random.default_rng(seed)):
+    for pose, distance in zip(*random_poses(points, 20, np.random.default_rng(seed)), strict=True):
         np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-9)
         assert np.linalg.det(pose[:3, :3]) > 0
         seen = (points - pose[:3, 3]) @ pose[:3, :3]
         off_axis = np.linalg.norm(seen[:, :2], axis=1)
-        assert (off_axis[seen[:, 2] > 0] < 1e-6 * (abs(shift) + scale)).any()
+        aimed_at = (off_axis < 1e-6 * (abs(shift) + scale)) & np.isclose(seen[:, 2], distance)
+        assert aimed_at.any()
 
 
 def test_random_poses_lie_inside_and_around() -> None:
-    positions = random_poses(CLOUD, 400, np.random.default_rng(0))[:, :3, 3]
+    positions = random_poses(CLOUD, 400, np.random.default_rng(0))[0][:, :3, 3]
     inside = ((positions > CLOUD.min(axis=0)) & (positions < CLOUD.max(axis=0))).all(axis=1)
     assert 0.2 < inside.mean() < 0.8
     distances = np.linalg.norm(positions[:, None] - CLOUD, axis=2).min(axis=1)
@@ -80,13 +82,13 @@ def test_random_poses_lie_inside_and_around() -> None:
 
 
 def test_the_same_seed_gives_the_same_poses() -> None:
-    a, b, c = (random_poses(CLOUD, 10, np.random.default_rng(seed)) for seed in (1, 1, 2))
+    a, b, c = (random_poses(CLOUD, 10, np.random.default_rng(seed))[0] for seed in (1, 1, 2))
     np.testing.assert_array_equal(a, b)
     assert not np.allclose(a, c)
 
 
 def test_a_single_point_is_looked_at() -> None:
-    poses = random_poses(np.ones((1, 3)), 5, np.random.default_rng(0))
+    poses, _ = random_poses(np.ones((1, 3)), 5, np.random.default_rng(0))
     assert poses.shape == (5, 4, 4)
     assert np.isfinite(poses).all()
 
@@ -103,14 +105,13 @@ def test_a_few_outliers_do_not_make_a_map_larger() -> None:
 
 def test_cells_are_as_large_as_they_are_far() -> None:
     grid = np.column_stack([*(axis.ravel() for axis in np.mgrid[-1:1:40j, -1:1:40j]), np.full(1600, 4.0)])
-    near, far = (cells(scale * grid, np.zeros(3), 0.25) for scale in (1.0, 16.0))
+    near, far = (cells(scale * grid, np.zeros(3)) for scale in (1.0, 16.0))
     assert len(near) == len(far)
-    assert len(cells(grid, np.zeros(3), 0.125)) > 2 * len(near)
 
 
 def test_cells_differ_by_side_and_distance() -> None:
     point = np.array([[0.1, 0.2, 0.3]])
-    seen_from = [cells(point, point[0] + offset, 0.25) for offset in ([1, 0, 0], [-1, 0, 0], [4, 0, 0], [1.01, 0, 0])]
+    seen_from = [cells(point, point[0] + offset) for offset in ([1, 0, 0], [-1, 0, 0], [4, 0, 0], [1.01, 0, 0])]
     assert seen_from[0] == seen_from[3]
     assert not seen_from[0] & seen_from[1]
     assert not seen_from[0] & seen_from[2]
@@ -129,7 +130,7 @@ def test_a_view_of_a_wall_shows_the_cells_of_the_wall(depth: float) -> None:
     found = seen_cells(wall(depth), camera, POSE, near=0.1)
     columns, rows = np.meshgrid(np.arange(2, camera.width, 4), np.arange(2, camera.height, 4))
     rays = camera.rays(np.column_stack([columns.ravel(), rows.ravel()]).astype(float))
-    assert found == cells(transform(POSE, np.float32(depth) * rays), POSE[:3, 3], 0.25) != set()
+    assert found == cells(transform(POSE, np.float32(depth) * rays), POSE[:3, 3]) != set()
 
 
 @pytest.mark.parametrize(
@@ -139,3 +140,10 @@ def test_a_view_of_a_wall_shows_the_cells_of_the_wall(depth: float) -> None:
 )
 def test_a_view_of_nothing_distinct_shows_nothing(render: Render) -> None:
     assert seen_cells(render, small_camera(), POSE, near=0.1) == set()
+
+
+def test_what_is_aimed_at_is_seen_unless_something_is_before_it() -> None:
+    assert sees(wall(2.0), 2.1)
+    assert not sees(wall(2.0), 4.0)
+    assert not sees(wall(4.0), 2.0)
+    assert not sees(wall(np.nan), 2.0)
