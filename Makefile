@@ -1,11 +1,12 @@
 # Every target does its own set-up (scripts/setup.sh).
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
-.PHONY: help demo test unit node real gpu gsplat lint build setup clean
+.PHONY: help demo test nightly unit node real gpu gsplat lint build setup clean
 
 help:
 	@echo "make demo   localize a camera in a made-up room, from start to end"
 	@echo "make test   lint, build, run all tests"
+	@echo "make nightly  the tests that make test leaves out: they cost much and rarely tell something"
 	@echo "make unit   the quick tests that need no ROS and no data: under a minute"
 	@echo "make node   test the installed node over real DDS"
 	@echo "make real   test with real maps and scenes, where they are (test/real/README.md)"
@@ -22,9 +23,13 @@ demo: build
 test: lint build
 	@. scripts/env.sh && python -P -m pytest
 
+# The option named last counts: the one of pyproject.toml comes before it.
+nightly: build
+	@. scripts/env.sh && python -P -m pytest -m nightly $(ARGS)
+
 # These run the sources here. Name a test or an option of pytest by ARGS: make unit ARGS="-k camera -x"
 unit: setup
-	@. scripts/env.sh && python -m pytest test/unit -m "not slow" $(ARGS)
+	@. scripts/env.sh && python -m pytest test/unit -m "not slow and not nightly" $(ARGS)
 
 real gpu: setup
 	@. scripts/env.sh && python -m pytest test/$@ $(ARGS)

@@ -241,19 +241,15 @@ def journey(seed: int) -> Iterator[tuple[str, np.ndarray]]:
         yield "carried off" if step == 0 else "walk on", walk.pose(lost_at + CARRIED_SECONDS + step * INTERVAL)
 
 
-def views(seed: int) -> list[View]:
-    """Return the journey in photos; a covered camera sees noise."""
+def views(seed: int) -> Iterator[View]:
+    """Yield the journey in photos; a covered camera sees noise."""
     rng, room_camera = np.random.default_rng(seed), RoomCamera(Room(seed=0), CAMERA)
-    return [
-        View(
-            phase,
-            pose,
-            rng.integers(0, 256, (CAMERA.height, CAMERA.width, 3), dtype=np.uint8)
-            if phase == "covered"
-            else room_camera.photo(lambda time, pose=pose: pose, 0.0, rng),
-        )
-        for phase, pose in journey(seed)
-    ]
+    for phase, pose in journey(seed):
+        if phase == "covered":
+            image = rng.integers(0, 256, (CAMERA.height, CAMERA.width, 3), dtype=np.uint8)
+        else:
+            image = room_camera.photo(lambda time, pose=pose: pose, 0.0, rng)
+        yield View(phase, pose, image)
 
 
 def odometry(last: View, view: View, rng: np.random.Generator) -> np.ndarray:
@@ -267,7 +263,7 @@ def odometry(last: View, view: View, rng: np.random.Generator) -> np.ndarray:
 
 def travel(slam: SlamStack, executor: SingleThreadedExecutor, seed: int, timeout: float) -> list[dict]:
     """Take the stack through the journey; return what it thinks at each view, until it gives up."""
-    rng, seen, record = np.random.default_rng(seed), views(seed), []
+    rng, last, record = np.random.default_rng(seed), None, []
 
     def spin_until(condition: Callable[[], bool], seconds: float) -> None:
         deadline = time.monotonic() + seconds
@@ -275,9 +271,8 @@ def travel(slam: SlamStack, executor: SingleThreadedExecutor, seed: int, timeout
             executor.spin_once(timeout_sec=0.05)
 
     spin_until(lambda: slam.is_served, timeout)
-    last = seen[0]
-    for view in seen:
-        motion = odometry(last, view, rng)
+    for view in views(seed):
+        motion = odometry(last or view, view, rng)
         # Lost, a robot stops: it sees the same until it has been answered.
         for _ in range(MAX_REQUESTS):
             slam.on_image(view.image, slam.get_clock().now().to_msg(), motion)

@@ -6,6 +6,12 @@ import importlib
 import os
 from pathlib import Path
 
+# Before a test imports torch, as the package sets it for the renderers and matchers that it makes: threads of OpenMP
+# that wait by spinning take ten times as long on a machine that does something else as well.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
+# isort: split
+
 import numpy as np
 import pytest
 from hypothesis import settings

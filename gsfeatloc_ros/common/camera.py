@@ -16,7 +16,7 @@ _COEFFICIENTS = {"plumb_bob": (0, 4, 5), "rational_polynomial": (0, 8, 12, 14), 
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """Intrinsics of a camera.
+    """Intrinsics of a camera, and how it moved while it took the photo.
 
     Attributes:
         width, height: image size in pixels.
@@ -24,6 +24,9 @@ class Camera:
         distortion: (n,) float64 coefficients in OpenCV's order for `model`; empty or all zero means none (for the
             equidistant model: an ideal fisheye).
         model: "plumb_bob", "rational_polynomial" or "equidistant" (fisheye), as in sensor_msgs/CameraInfo.
+        readout: (6,) how a camera with a rolling shutter moved, evenly, from its first row to its last: translation in
+            map units and rotation vector in radians, in its own axes at the middle row; None where that is not known,
+            or its shutter is a global one.
 
     Raises:
         ValueError: a size or focal length that is not positive, a value that is not finite, a K that is not
@@ -35,6 +38,7 @@ class Camera:
     K: np.ndarray
     distortion: np.ndarray = field(default_factory=lambda: np.zeros(0))
     model: str = "plumb_bob"
+    readout: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "K", np.asarray(self.K, dtype=np.float64).reshape(3, 3))

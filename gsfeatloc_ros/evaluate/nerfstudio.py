@@ -38,6 +38,15 @@ def load(folder: Path) -> tuple[list[PosedPhoto], np.ndarray]:
     return photos, np.array(list(poses.values()))
 
 
+def load_poses(path: Path) -> np.ndarray:
+    """Read the poses (F, 4, 4) of all frames of a transforms file; raise ValueError where there is none."""
+    with naming(path):
+        poses = [frame_pose(frame) for frame in read_transforms(path)["frames"]]
+        if not poses:
+            raise ValueError("frames is empty")
+    return np.array(poses)
+
+
 @contextmanager
 def naming(path: Path) -> Iterator[None]:
     """Turn what goes wrong while a transforms file is read into a ValueError that names it."""

@@ -6,6 +6,8 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from gsfeatloc_ros.evaluate import colmap, nerf_synthetic, nerfstudio
 from gsfeatloc_ros.evaluate.dataset import Scene, read_image
 from gsfeatloc_ros.localize.engine import load_renderer
@@ -55,6 +57,17 @@ def load_scene(folder: str | Path, map_path: str | Path | None = None) -> Scene:
         trajectory=trajectory,
         background=_WHITE if read_image(photos[0].path).shape[2] == 4 else _BLACK,
     )
+
+
+def load_poses(path: str | Path) -> np.ndarray:
+    """Read the poses (F, 4, 4) of all frames of a scene folder, or of a transforms file, in the frame of its map.
+
+    Raises:
+        ValueError, RuntimeError: as load_scene.
+    """
+    path = Path(path)
+    # The map does not matter.
+    return nerfstudio.load_poses(path) if path.is_file() else load_scene(path, path).trajectory
 
 
 def load_scene_renderer(scene: Scene, renderer: RendererSettings) -> Renderer:

@@ -12,15 +12,15 @@ from gsfeatloc_ros.common.arrays import to_host
 from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.stage_clock import Interrupted
 from gsfeatloc_ros.index.options import IndexOptions
-from gsfeatloc_ros.index.placement import CELL, cells, cover, radius, random_poses, seen_cells
+from gsfeatloc_ros.index.placement import cover, overlap, radius, random_poses, seen_cells, sees
 from gsfeatloc_ros.index.view_index import ViewIndex
 from gsfeatloc_ros.match.base import Features, Matcher
 from gsfeatloc_ros.pose.lift import LiftOptions, lift
 from gsfeatloc_ros.render.base import Renderer
 
 # Poses that are looked at small for each view that is wanted, and how many of them are looked at closely.
-_CANDIDATES_PER_VIEW = 16
-_SHORTLIST = 4
+_CANDIDATES_PER_VIEW = 20
+_SHORTLIST = 2
 # Width, height and focal length, in pixels, of small views and of views.
 _SMALL_VIEW = (80, 60, 72.0)
 _VIEW = (320, 240, 288.0)
@@ -33,8 +33,11 @@ _MAX_FEATURES = 225
 _SAME_POINT = 0.02
 _ALIKE = 0.75
 _NEIGHBOURS = 12
-# Confirmed features are counted in cells of this share of those of surfaces.
-_FEATURE_CELL = 0.5 * CELL
+# A view with so many confirmed features is as good as one with more; no more than so many are kept.
+_ENOUGH_FEATURES = 100
+_MAX_KEPT_FEATURES = 140
+# Views are chosen to suit at most so many photos.
+_MAX_PHOTOS = 5_000
 
 
 def build_index(
@@ -47,9 +50,9 @@ def build_index(
 ) -> ViewIndex:
     """Make a view index.
 
-    Poses among the solid Gaussians are looked from in small; of those that together show most of the map, seen from
-    near and far and from all sides, the features are found and lifted; the views whose features other views confirm,
-    and that show most, are kept.
+    Poses among the solid Gaussians are looked from in small, as photos may be taken there. Of those that show most of
+    what any of these photos shows, from about as far and from about the same side, the features are found and lifted.
+    Those views are kept that suit the photos best by the features that other views confirm.
 
     Args:
         renderer: of the map.
@@ -57,7 +60,7 @@ def build_index(
         options: how many views.
         progress: called with the number of views looked at and of all that will be.
         interrupted: whether to give up, asked before each view.
-        poses: (P, 4, 4) T_map_camera of the map's photos, if known: they are chosen from first.
+        poses: (P, 4, 4) T_map_camera of the map's photos, if known: views are chosen to suit these.
 
     Raises:
         Interrupted: `interrupted` said so.
@@ -66,7 +69,8 @@ def build_index(
     rng = np.random.default_rng(options.seed)
     points = renderer.solid_points
     given = np.empty((0, 4, 4)) if poses is None else np.asarray(poses, np.float64)
-    candidates = np.concatenate([given, random_poses(points, _CANDIDATES_PER_VIEW * options.views, rng)])
+    drawn, distances = random_poses(points, _CANDIDATES_PER_VIEW * options.views, rng)
+    candidates = np.concatenate([given, drawn])
     total = len(candidates) + min(_SHORTLIST * options.views, len(candidates))
 
     def check(done: int) -> None:
@@ -78,17 +82,21 @@ def build_index(
     seen = []
     for number, pose in enumerate(candidates):
         check(number)
-        seen.append(seen_cells(renderer.render(small, pose), small, pose, near))
-    shortlist = cover(seen, _SHORTLIST * options.views, len(given))
+        render = renderer.render(small, pose)
+        free = number < len(given) or sees(render, distances[number - len(given)])
+        seen.append(seen_cells(render, small, pose, near) if free else set())
+    photos = np.arange(len(candidates)) if poses is None else np.arange(len(given))
+    photos = photos[:: -(-len(photos) // _MAX_PHOTOS)]
+    worth = overlap([seen[photo] for photo in photos], seen)
+    shortlist = cover(worth, _SHORTLIST * options.views)
     views = []
     for number, candidate in enumerate(shortlist):
         check(len(candidates) + number)
         views.append(_look(renderer, matcher, candidates[candidate]))
     _confirm(views)
-    first = sum(candidate < len(given) for candidate in shortlist)
-    chosen = cover([view.confirmed_cells() for view in views], options.views, first)
+    quality = np.minimum([view.confirmed.sum() / _ENOUGH_FEATURES for view in views], 1.0).astype(np.float32)
+    kept = [views[view] for view in cover(worth[:, shortlist] * quality, options.views)]
     progress(total, total)
-    kept = [views[view] for view in chosen]
     return ViewIndex.compress(
         np.array([view.pose for view in kept]).reshape(-1, 4, 4),
         [view.descriptors[view.confirmed] for view in kept] or [np.empty((0, 1))],
@@ -116,10 +124,6 @@ class _View:
     def distances(self) -> np.ndarray:
         """Distances (m,) of the points from the camera."""
         return np.linalg.norm(self.points - self.pose[:3, 3], axis=1)
-
-    def confirmed_cells(self) -> set[int]:
-        """What the confirmed features show."""
-        return cells(self.points[self.confirmed], self.pose[:3, 3], _FEATURE_CELL)
 
 
 def _camera(width: int, height: int, focal_length: float) -> Camera:
@@ -156,4 +160,5 @@ def _confirm(views: list[_View]) -> None:
             confirmed |= same
     starts = np.cumsum([len(view.points) for view in views])[:-1]
     for view, part in zip(views, np.split(confirmed, starts), strict=True):
-        view.confirmed = part
+        # The strongest come first.
+        view.confirmed = part & (np.cumsum(part) <= _MAX_KEPT_FEATURES)

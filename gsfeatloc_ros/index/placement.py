@@ -6,6 +6,7 @@ import heapq
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from gsfeatloc_ros.common.arrays import to_host
 from gsfeatloc_ros.common.camera import Camera
@@ -20,6 +21,8 @@ _DISTANCES = (0.1, 2.0)
 # Views that show so little, or of which so much is too near, are of no use.
 _MIN_SEEN = 0.2
 _MAX_NEAR = 0.05
+# What is aimed at is seen if something is seen at its distance but for this share.
+_MAX_DISTANCE_ERROR = 0.2
 # A pixel shows a surface where it is covered so far and its depths spread over no more than this share of the depth.
 _MIN_ALPHA = 0.9
 _MAX_SPREAD = 0.15
@@ -27,12 +30,12 @@ _MAX_SPREAD = 0.15
 _PIXEL_STEP = 4
 # What is seen is counted in cells of this share of its distance, rounded to a power of two, and by the direction from
 # which it is seen, one of so many: features look the same only from near where they were seen.
-CELL = 0.25
+_CELL = 0.25
 _DIRECTIONS = 12
 
 
-def random_poses(points: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Draw poses (count, 4, 4), T_map_camera, each aimed at one of the points (N, 3).
+def random_poses(points: np.ndarray, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Draw poses (count, 4, 4), T_map_camera, each aimed at one of the points (N, 3), and the distances (count,) to it.
 
     Half of them lie anywhere in the box of the points, as cameras in rooms do; half at any distance from what they look
     at, as those round an object do.
@@ -50,13 +53,21 @@ def random_poses(points: np.ndarray, count: int, rng: np.random.Generator) -> np
     away /= np.linalg.norm(away, axis=1, keepdims=True)
     distances = radius(points) * np.exp(rng.uniform(np.log(_DISTANCES[0]), np.log(_DISTANCES[1]), (count, 1)))
     positions = np.where(rng.random((count, 1)) < 0.5, inside, targets + distances * away)
-    return np.array([_aimed(*pair, rng) for pair in zip(positions, targets, strict=True)])
+    poses = np.array([_aimed(*pair, rng) for pair in zip(positions, targets, strict=True)])
+    return poses, np.linalg.norm(targets - positions, axis=1)
 
 
 def radius(points: np.ndarray) -> float:
     """Return half of the diagonal of the box of points (N, 3), but for outliers."""
     low, high = _box(points)
     return 0.5 * float(np.linalg.norm(high - low))
+
+
+def sees(render: Render, distance: float) -> bool:
+    """Return whether what lies ahead is about so far away: behind a wall, or inside a thing, it is not."""
+    height, width = render.alpha.shape
+    ahead = float(render.median_depth[height // 2, width // 2])
+    return abs(ahead - distance) <= _MAX_DISTANCE_ERROR * distance
 
 
 def seen_cells(render: Render, camera: Camera, T_map_camera: np.ndarray, near: float) -> set[int]:
@@ -78,50 +89,61 @@ def seen_cells(render: Render, camera: Camera, T_map_camera: np.ndarray, near: f
         return set()
     rays = camera.rays(np.column_stack([columns, rows]).astype(np.float64)[surface])
     points = (rays * depth[surface, None]) @ T_map_camera[:3, :3].T + T_map_camera[:3, 3]
-    return cells(points, T_map_camera[:3, 3], CELL)
+    return _cells(points, T_map_camera[:3, 3])
 
 
-def cells(points: np.ndarray, centre: np.ndarray, size: float) -> set[int]:
-    """Return the cells, numbered by a hash, of points (N, 3) seen from a `centre` (3,).
-
-    Args:
-        points: (N, 3) map frame.
-        centre: (3,) of the camera.
-        size: of the cells, as a share of the distance.
-    """
+def _cells(points: np.ndarray, centre: np.ndarray) -> set[int]:
+    """Return the cells, numbered by a hash, of points (N, 3) seen from a `centre` (3,)."""
     offsets = points - centre
     distances = np.linalg.norm(offsets, axis=1)
     octaves = np.round(np.log2(np.maximum(distances, np.finfo(float).tiny)))
-    grid = np.floor(points / (size * 2.0**octaves)[:, None])
+    grid = np.floor(points / (_CELL * 2.0**octaves)[:, None])
     directions = (offsets @ _sphere(_DIRECTIONS).T).argmax(axis=1)
     keys = np.column_stack([octaves, grid, directions]).astype(np.int64)
     return {hash(key.tobytes()) for key in keys}
 
 
-def cover(seen: Sequence[set[int]], count: int, first: int = 0) -> list[int]:
-    """Choose up to `count` of the views that show most cells together, by the greedy algorithm.
+def overlap(photos: Sequence[set[int]], views: Sequence[set[int]]) -> np.ndarray:
+    """Return the share (P, V) float32 of the cells of each of P photos that each of V views shows as well."""
+    numbers: dict[int, int] = {}
 
-    By Nemhauser et al. (1978) it is no farther than a factor of 1 - 1/e from the best choice.
+    def incidence(seen: Sequence[set[int]]) -> csr_array:
+        columns = [numbers.setdefault(cell, len(numbers)) for cells_seen in seen for cell in cells_seen]
+        starts = np.concatenate([[0], np.cumsum([len(cells_seen) for cells_seen in seen])])
+        return csr_array((np.ones(len(columns), np.float32), columns, starts), (len(seen), max(len(numbers), 1)))
+
+    incidence(photos)
+    of_views = incidence(views)
+    of_photos = incidence(photos)
+    of_photos.resize((len(photos), of_views.shape[1]))
+    sizes = np.maximum([len(photo) for photo in photos], 1).astype(np.float32)
+    return np.asarray((of_photos @ of_views.T).todense(), np.float32) / sizes[:, None]
+
+
+def cover(worth: np.ndarray, count: int) -> list[int]:
+    """Choose up to `count` views so that photos find one that shows much of them.
+
+    Facility location by the greedy algorithm, evaluated lazily (Minoux, 1978); by Nemhauser et al. (1978) the sum over
+    the photos is no farther than a factor of 1 - 1/e from the best.
 
     Args:
-        seen: the cells of each view.
+        worth: (P, V) what each view is worth to each photo, which takes the best; not negative.
         count: most views.
-        first: so many of the views, from the first on, are chosen from before the others.
     """
     chosen: list[int] = []
-    covered: set[int] = set()
-    for part in (range(first), range(first, len(seen))):
-        # Gains only shrink: one that is still the largest after it was counted anew is the largest of all.
-        gains = [(-len(seen[view]), view) for view in part]
-        heapq.heapify(gains)
-        while gains and len(chosen) < count:
-            _, view = heapq.heappop(gains)
-            gain = len(seen[view] - covered)
-            if gains and gain < -gains[0][0]:
-                heapq.heappush(gains, (-gain, view))
-            elif gain > 0:
-                chosen.append(view)
-                covered |= seen[view]
+    best = np.zeros(len(worth), worth.dtype)
+    by_view = np.ascontiguousarray(worth.T)
+    # Gains only shrink: one that is still the largest after it was computed anew is the largest of all.
+    gains = [(-float(total), view) for view, total in enumerate(by_view.sum(axis=1))]
+    heapq.heapify(gains)
+    while gains and len(chosen) < count:
+        _, view = heapq.heappop(gains)
+        gain = float(np.maximum(by_view[view] - best, 0).sum())
+        if gains and gain < -gains[0][0]:
+            heapq.heappush(gains, (-gain, view))
+        elif gain > 0:
+            chosen.append(view)
+            best = np.maximum(best, by_view[view])
     return chosen
 
 

@@ -114,7 +114,7 @@ def _read(stream: BinaryIO, path: Path, key: dict[str, Any] | None) -> ViewIndex
         header = json.loads(encoded)
         sizes = {name: int(header["sizes"][name]) for name in _MAX_SIZES}
         stored = header["key"]
-    except (KeyError, TypeError, ValueError, RecursionError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
         raise damaged from error
     if not all(0 < sizes[name] <= most for name, most in _MAX_SIZES.items()):
         raise damaged

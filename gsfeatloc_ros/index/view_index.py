@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -76,6 +77,20 @@ class ViewIndex:
         points = self.points[kept][matches.b[:, 0].astype(int)]
         return matches, self.low + points / _STEPS * (self.high - self.low)
 
+    @cached_property
+    def centres(self) -> np.ndarray:
+        """What the views look at: the medians (N, 3) of their points, map frame; of a view without any its place."""
+        steps = [
+            np.median(self.points[start:end], axis=0) if end > start else None
+            for start, end in pairwise(self._first.tolist())
+        ]
+        return np.array(
+            [
+                pose[:3, 3] if step is None else self.low + step / _STEPS * (self.high - self.low)
+                for pose, step in zip(self.poses, steps, strict=True)
+            ]
+        ).reshape(-1, 3)
+
     @staticmethod
     def compress(poses: np.ndarray, descriptors: list[np.ndarray], points: list[np.ndarray]) -> ViewIndex:
         """Make an index of views.
@@ -93,8 +108,11 @@ class ViewIndex:
         every, where = np.concatenate(descriptors), np.concatenate(points)
         if len(every) == 0:
             raise ValueError("the map shows nothing that could be recognized: no view of it has features")
+        if every.shape[1] % CODE_BYTES:
+            raise ValueError(f"descriptors of {every.shape[1]} numbers are no multiple of {CODE_BYTES}")
         quantizer = faiss.ProductQuantizer(every.shape[1], CODE_BYTES, round(math.log2(_VALUES)))
-        # Fewer than its values it would refuse to train on.
+        # It warns of few on standard error; and fewer than its values it would refuse to train on.
+        quantizer.cp.min_points_per_centroid = 1
         quantizer.train(np.resize(every, (max(len(every), _VALUES), every.shape[1])))
         low, high = where.min(axis=0), where.max(axis=0)
         steps = np.round((where - low) / np.maximum(high - low, np.finfo(float).tiny) * _STEPS)

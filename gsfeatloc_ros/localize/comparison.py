@@ -13,7 +13,7 @@ from gsfeatloc_ros.common.local_structure import local_structure
 from gsfeatloc_ros.common.photo import Photo
 from gsfeatloc_ros.localize.query import MatchedView, Query
 from gsfeatloc_ros.pose.lift import lift
-from gsfeatloc_ros.pose.solve import Correspondences, reprojection_errors
+from gsfeatloc_ros.pose.solve import reprojection_errors
 
 # Cells across and down the photo.
 CELLS = (16, 12)
@@ -81,8 +81,7 @@ def compare(query: Query, view: MatchedView, tolerance: float) -> Comparison:
     with query.clock.stage("track"):
         back = query.tracker.track_back(view.image)
     lifted = lift(view.render, camera, view.pose, back.b, options.lift)
-    valid = lifted.valid
-    found = Correspondences(back.a[valid], lifted.points[valid], lifted.sigmas[valid])
+    found = query.correspondences(back.a, lifted, view.pose)
     agrees = view.solution.errors <= tolerance
     agrees_back = reprojection_errors(camera, pose, found) <= tolerance
     pixels, all_agree = np.concatenate([view.found.pixels, found.pixels]), np.concatenate([agrees, agrees_back])

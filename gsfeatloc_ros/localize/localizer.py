@@ -173,13 +173,12 @@ class Localizer:
         view = query.track(pose)
         with query.clock.stage("track"):
             blur = estimate_blur(query.photo.gray(), cv2.cvtColor(to_host(view.image), cv2.COLOR_RGB2GRAY))
-        if blur is not None:
+        passes, max_passes = 1, self._components.options.max_passes
+        if blur is not None and passes < max_passes:
             view = query.track(pose if view.solution is None else view.solution.T_map_camera, blur)
-        passes = 1
+            passes += 1
         while (
-            view.solution is not None
-            and view.offset(query.photo.camera) >= _MAX_SETTLED_OFFSET
-            and passes < self._components.options.max_passes
+            view.solution is not None and view.offset(query.photo.camera) >= _MAX_SETTLED_OFFSET and passes < max_passes
         ):
             view = query.track(view.solution.T_map_camera, blur)
             passes += 1

@@ -18,7 +18,8 @@ from gsfeatloc_ros.index import ViewIndex
 from gsfeatloc_ros.localize.blur import Blur
 from gsfeatloc_ros.localize.options import LocalizerOptions
 from gsfeatloc_ros.match.base import Matcher, Matches, Tracker
-from gsfeatloc_ros.pose.lift import lift
+from gsfeatloc_ros.pose.lift import Lifted, lift
+from gsfeatloc_ros.pose.readout import at_middle_row
 from gsfeatloc_ros.pose.solve import Correspondences, PoseSolution, solve_pose
 from gsfeatloc_ros.render.base import Render, Renderer
 
@@ -141,6 +142,15 @@ class Query:
             matches = tracker.track(image)
         return self._solve(pose, render, image, matches)
 
+    def correspondences(self, pixels: np.ndarray, lifted: Lifted, pose: np.ndarray) -> Correspondences:
+        """Return pixels (M, 2) of the photo with the points of the map there, where these could be lifted.
+
+        The pose (4, 4) is the one at which they were: without the motion of a rolling shutter they are seen from there.
+        """
+        kept = lifted.valid
+        found = Correspondences(pixels[kept], lifted.points[kept], lifted.sigmas[kept])
+        return at_middle_row(self.photo.camera, pose, found)
+
     def _render(self, pose: np.ndarray) -> Render:
         with self.clock.stage("render"):
             return self.components.renderer.render(self.photo.camera, pose)
@@ -150,6 +160,6 @@ class Query:
         with self.clock.stage("solve"):
             lifted = lift(render, camera, pose, matches.b, options.lift)
             lifted_matches = matches.select(lifted.valid)
-            found = Correspondences(lifted_matches.a, lifted.points[lifted.valid], lifted.sigmas[lifted.valid])
+            found = self.correspondences(matches.a, lifted, pose)
             solution = solve_pose(camera, found, options.pose, options.seed, self.plausible)
         return MatchedView(pose, render, image, len(matches), lifted_matches, found, solution)

@@ -9,13 +9,16 @@ import numpy as np
 
 from gsfeatloc_ros.index import ViewIndex
 from gsfeatloc_ros.localize.query import Query
-from gsfeatloc_ros.match.base import Features
+from gsfeatloc_ros.match.base import Features, Matches
 from gsfeatloc_ros.pose.solve import Correspondences, ransac_pose
 
 # Matches of a small photo with a view agree with a pose within so many pixels.
 _MAX_ERROR = 4.0
 # A view whose pose a prior holds for possible counts so many times as much as another that as much speaks for.
 _WEIGHT_OF_PRIOR = 3.0
+# The neighbours of a view, itself included, are looked for among so many that most speaks for.
+_NEIGHBOURS = 6
+_MAX_RANKED = 60
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,17 +51,40 @@ def retrieve(small: Query, index: ViewIndex, likely: Callable[[np.ndarray], bool
         found = features.on_host()
         weights = np.where([likely(pose) for pose in index.poses], 1.0, 1.0 / _WEIGHT_OF_PRIOR)
         order = np.argsort(-index.rank(found) * weights, kind="stable")
+    group = _Group(small, index, found, order)
     for view in order:
         with small.clock.stage("search"):
-            hint = _hint(small, index, found, view)
+            hint = group.hint(view)
         if hint is None:
             yield None
         else:
             yield Hint(hint[0], hint[1], hint[1] * (1.0 if likely(hint[0]) else 1.0 / _WEIGHT_OF_PRIOR))
 
 
-def _hint(small: Query, index: ViewIndex, features: Features, view: int) -> tuple[np.ndarray, int] | None:
-    matches, points = index.match(features, view)
-    found = Correspondences(matches.a, points, np.zeros_like(points))
-    solved = ransac_pose(small.photo.camera, found, _MAX_ERROR, small.components.options.seed)
-    return None if solved is None else (solved[0], int(solved[1].sum()))
+class _Group:
+    """A photo's matches with views of an index, and with those beside each that show the same from elsewhere.
+
+    One view alone often has too few.
+    """
+
+    def __init__(self, small: Query, index: ViewIndex, features: Features, order: np.ndarray) -> None:
+        self._small, self._index, self._features = small, index, features
+        self._ranked = order[:_MAX_RANKED]
+        self._matches: dict[int, tuple[Matches, np.ndarray]] = {}
+
+    def hint(self, view: int) -> tuple[np.ndarray, int] | None:
+        """Return the pose (4, 4) on which most of a view's and its neighbours' matches agree, and how many of them."""
+        centres = self._index.centres
+        gaps = np.linalg.norm(centres[self._ranked] - centres[view], axis=1)
+        beside = self._ranked[np.argsort(gaps, kind="stable")[:_NEIGHBOURS]]
+        pairs = [self._match(int(other)) for other in dict.fromkeys([view, *beside.tolist()])]
+        pixels, points = np.concatenate([m.a for m, _ in pairs]), np.concatenate([p for _, p in pairs])
+        found = Correspondences(pixels, points, np.zeros_like(points))
+        solved = ransac_pose(self._small.photo.camera, found, _MAX_ERROR, self._small.components.options.seed)
+        # A pixel that several views know counts once.
+        return None if solved is None else (solved[0], len(np.unique(pixels[solved[1]], axis=0)))
+
+    def _match(self, view: int) -> tuple[Matches, np.ndarray]:
+        if view not in self._matches:
+            self._matches[view] = self._index.match(self._features, view)
+        return self._matches[view]

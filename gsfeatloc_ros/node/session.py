@@ -146,6 +146,7 @@ class Session:
         """Go on with other settings, but for those that are read when the node is configured."""
         self.settings = settings
         self._inputs.policy = settings.prior_policy()
+        self._inputs.line_delay = settings.image.line_delay
         self._follower.state.options = settings.recovery.state
         self._follower.images_come = settings.node.mode != ON_REQUEST
         self.reception.use_settings(settings)

@@ -82,6 +82,13 @@ class ImageSettings:
     rectified: bool = parameter(
         False, "Whether images are rectified: then the camera is that of camera_info's P, without distortion."
     )
+    line_delay: float = parameter(
+        0.0,
+        "Seconds from a row to the next of a rolling shutter, whose effect is taken out by odometry; stamps are of the "
+        "middle row. 0 for a global shutter.",
+        (0.0, 0.001),
+        live=True,
+    )
     timeout: float = parameter(
         5.0, "Seconds without an image after which there is none for requests.", (0.1, 3600.0), live=True
     )

@@ -114,34 +114,33 @@ def solve_pose(
     first: PoseSolution | None = None
     others = np.arange(len(found.pixels))
     for _ in range(_MAX_IMPLAUSIBLE_POSES + 1):
-        solved = _solve(camera, found.select(others), options, seed)
-        if solved is None:
+        solution = _solve(camera, found, others, options, seed)
+        if solution is None:
             break
-        T_map_camera, covariance = solved
-        errors = reprojection_errors(camera, T_map_camera, found)
-        inliers = errors <= options.max_reprojection_error
-        rms = float(np.sqrt(np.mean(errors[inliers] ** 2)))
-        solution = PoseSolution(T_map_camera, covariance, errors, inliers, rms)
-        if plausible(T_map_camera):
+        if plausible(solution.T_map_camera):
             return solution
         first = first or solution
-        others = others[~inliers[others]]
+        others = others[~solution.inliers[others]]
     return first
 
 
 def _solve(
-    camera: Camera, found: Correspondences, options: PoseOptions, seed: int
-) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return the pose (4, 4) that most matches agree on, and its covariance (6, 6), or None."""
-    sampled = ransac_pose(camera, found, options.max_reprojection_error, seed)
+    camera: Camera, found: Correspondences, among: np.ndarray, options: PoseOptions, seed: int
+) -> PoseSolution | None:
+    """Return the pose that most of the matches of indices `among` (N,) agree on, or None; errors are those of all."""
+    candidates = found.select(among)
+    sampled = ransac_pose(camera, candidates, options.max_reprojection_error, seed)
     if sampled is None:
         return None
-    start, inliers = sampled
-    refined = refine_pose(camera, start, found.select(inliers), options)
+    start, agreeing = sampled
+    refined = refine_pose(camera, start, candidates.select(agreeing), options)
     if refined is None:
         return None
-    agreeing = reprojection_errors(camera, refined[0], found) <= options.max_reprojection_error
-    return refined if agreeing.sum() >= MIN_POINTS else None
+    errors = reprojection_errors(camera, refined[0], found)
+    inliers = errors <= options.max_reprojection_error
+    if inliers[among].sum() < MIN_POINTS:
+        return None
+    return PoseSolution(*refined, errors, inliers, float(np.sqrt(np.mean(errors[inliers] ** 2))))
 
 
 def ransac_pose(

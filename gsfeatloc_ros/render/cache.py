@@ -145,7 +145,10 @@ def map_content(path: str | Path) -> list[Any]:
     Raises:
         MapError: the map cannot be read.
     """
-    return [[identity[1], identity[3]] for identity in map(_identity, _map_files(Path(os.path.abspath(path))))]
+    files = _map_files(Path(os.path.abspath(path)))
+    if not files:
+        raise MapError(f"{path}: cannot be read: there is no such map")
+    return [[identity[1], identity[3]] for identity in map(_identity, files)]
 
 
 def _map_files(path: Path) -> list[Path]:

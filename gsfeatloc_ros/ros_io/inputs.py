@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from threading import Lock
 from typing import Any, Generic, TypeVar
@@ -43,7 +43,7 @@ class LocalizerInput:
 
     Attributes:
         image: (H, W, 3) uint8 RGB.
-        camera: of the image.
+        camera: of the image, with its motion while the rows were read, where that is known.
         T_map_camera_prior: (4, 4); None where nothing is known.
         prior_covariance: (6, 6) in ROS order about the map's axes, or None where it is not known.
         prior: what the two were made of, if anything.
@@ -92,14 +92,19 @@ class Inputs:
     thread and images asked for in another.
 
     Args:
-        policy: what priors are worth; may be replaced later.
+        policy: what priors are worth.
         lookup: of the robot's frames.
         rectified: whether images are.
         no_camera: what to say while there is no camera_info.
+
+    Attributes:
+        policy: what priors are worth; may be replaced later.
+        line_delay: seconds from a row of images to the next; 0 for a global shutter. May be replaced later.
     """
 
     def __init__(self, policy: PriorPolicy, lookup: Lookup, rectified: bool, no_camera: str) -> None:
         self.policy = policy
+        self.line_delay = 0.0
         self._lookup = lookup
         self._rectified = rectified
         self._camera: _Newest[Camera] = _Newest(problem=no_camera)
@@ -218,9 +223,9 @@ class Inputs:
                 f"camera_info is for {camera.width}x{camera.height} but the image is {width}x{height}: use the "
                 "camera_info of this image"
             )
-        pose, covariance = None, None
-        if prior is not None:
-            pose, covariance = self._at(prior, nanoseconds(message.header.stamp), message.header.frame_id)
+        stamp, frame = nanoseconds(message.header.stamp), message.header.frame_id
+        pose, covariance = (None, None) if prior is None else self._at(prior, stamp, frame)
+        camera = replace(camera, readout=self._readout(stamp, frame, height))
         return LocalizerInput(decode_picture(message), camera, pose, covariance, prior, newest.value)
 
     def _set_prior(self, newest: _Newest[Prior]) -> None:
@@ -236,6 +241,16 @@ class Inputs:
             self._odometry = self._no_odometry()
             self._odometry_frame = message.child_frame_id
         self._odometry.add(nanoseconds(message.header.stamp), pose)
+
+    def _readout(self, stamp: int, camera_frame: str, rows: int) -> np.ndarray | None:
+        """Return how the camera moved (6,) while it read the rows of an image; None where that is not known."""
+        velocity = self._odometry.velocity(stamp) if stamp and self.line_delay else None
+        if velocity is None:
+            return None
+        T_body_camera = self._lookup(self._odometry_frame, camera_frame, stamp)
+        linear, angular = velocity[:3] + np.cross(velocity[3:], T_body_camera[:3, 3]), velocity[3:]
+        in_camera = np.concatenate([linear @ T_body_camera[:3, :3], angular @ T_body_camera[:3, :3]])
+        return rows * self.line_delay * in_camera
 
     def _at(self, prior: Prior, stamp: int, camera_frame: str) -> tuple[np.ndarray, np.ndarray | None]:
         """Return the pose (4, 4) and covariance (6, 6) of the camera in the map frame at `stamp` by a prior."""

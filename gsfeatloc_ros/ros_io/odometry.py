@@ -67,6 +67,19 @@ class OdometryBuffer:
             at_start, at_end = self._at(start), self._at(end)
         return None if at_start is None or at_end is None else invert(at_start) @ at_end
 
+    def velocity(self, stamp: int) -> np.ndarray | None:
+        """Return how the body moves at `stamp` (nanoseconds): (6,) metres and radians a second, in its own axes.
+
+        It is that between the poses before and after, or the two nearest. None where these are not near.
+        """
+        with self._lock:
+            after = min(max(bisect_left(self._stamps, stamp), 1), len(self._stamps) - 1)
+            if after < 1 or max(abs(self._stamps[i] - stamp) for i in (after - 1, after)) > _MAX_DISTANCE:
+                return None
+            motion = invert(self._poses[after - 1]) @ self._poses[after]
+            seconds = 1e-9 * (self._stamps[after] - self._stamps[after - 1])
+        return np.concatenate([motion[:3, 3], so3_log(motion[:3, :3])]) / seconds
+
     def travelled(self, start: int, end: int) -> Travelled | None:
         """Return how long the way was between two times (nanoseconds), to the next messages; None as of `motion`."""
         with self._lock:

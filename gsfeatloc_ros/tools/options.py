@@ -10,6 +10,7 @@ from typing import Any
 
 from gsfeatloc_ros.common.parameter import parameters_of
 from gsfeatloc_ros.localize.options import LocalizerOptions
+from gsfeatloc_ros.localize.settings import MapSettings
 
 # Have options of the commands of their own.
 _OWN_OPTIONS = ("max_image_width", "seed")
@@ -76,6 +77,29 @@ def number(kind: Callable[[str], float], minimum: float) -> Callable[[str], floa
         return value
 
     return parse
+
+
+def add_map_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of where the map lies, for `map_settings`; the parser has `map`, its path."""
+    default, finite = MapSettings(), number(float, -math.inf)
+    frame = parser.add_argument_group("the map's frame", "as the node's parameters map.*")
+    frame.add_argument("--map-frame", default=default.frame_id, metavar="NAME", help="default: %(default)s")
+    frame.add_argument("--map-scale", type=finite, default=default.scale, metavar="S", help="default: %(default)s")
+    frame.add_argument("--map-translation", type=finite, nargs=3, default=default.translation, metavar=("X", "Y", "Z"))
+    frame.add_argument("--map-rotation", type=finite, nargs=4, default=default.rotation, metavar=("X", "Y", "Z", "W"))
+    frame.add_argument("--dataparser-transforms", default="", metavar="FILE", help="nerfstudio's")
+
+
+def map_settings(options: argparse.Namespace) -> MapSettings:
+    """Return the map that options name, and where it lies."""
+    return MapSettings(
+        path=str(options.map),
+        frame_id=options.map_frame,
+        scale=options.map_scale,
+        translation=tuple(options.map_translation),
+        rotation=tuple(options.map_rotation),
+        dataparser_transforms=options.dataparser_transforms,
+    )
 
 
 def add_old_name(parser: argparse.ArgumentParser, option: argparse.Action, old: str) -> None:

@@ -13,7 +13,6 @@ stamp of the image, between two poses that are not more than 0.25 s apart.
 from __future__ import annotations
 
 import argparse
-import math
 import sys
 import time
 from collections import Counter
@@ -28,7 +27,7 @@ from gsfeatloc_ros.evaluate.extras import import_extra
 from gsfeatloc_ros.localize.engine import Engine, load_matcher, load_renderer
 from gsfeatloc_ros.localize.localizer import Localizer
 from gsfeatloc_ros.localize.options import LocalizerOptions
-from gsfeatloc_ros.localize.settings import MapSettings, MatcherSettings, RendererSettings
+from gsfeatloc_ros.localize.settings import MatcherSettings, RendererSettings
 from gsfeatloc_ros.match import MATCHERS
 from gsfeatloc_ros.replay.bag import Bag, BagError, Role, open_bag
 from gsfeatloc_ros.replay.figure import write_figure
@@ -37,7 +36,14 @@ from gsfeatloc_ros.replay.run import Replay, ReplayedImage
 from gsfeatloc_ros.replay.truth import Trajectory
 from gsfeatloc_ros.ros_io.outcome import OutcomeStatus
 from gsfeatloc_ros.ros_io.prior import PriorPolicy
-from gsfeatloc_ros.tools.options import CollectSettings, localizer_options, number, setting
+from gsfeatloc_ros.tools.options import (
+    CollectSettings,
+    add_map_options,
+    localizer_options,
+    map_settings,
+    number,
+    setting,
+)
 
 # Reasons of a kind in the summary, of which there may be as many as images.
 _MAX_REASONS = 5
@@ -105,14 +111,7 @@ def _collect(replay: Replay, count: int) -> tuple[list[ReplayedImage], int]:
 
 
 def _localizer(options: argparse.Namespace) -> Localizer:
-    map_ = MapSettings(
-        path=str(options.map),
-        frame_id=options.map_frame,
-        scale=options.map_scale,
-        translation=tuple(options.map_translation),
-        rotation=tuple(options.map_rotation),
-        dataparser_transforms=options.dataparser_transforms,
-    )
+    map_ = map_settings(options)
     renderer = load_renderer(map_, RendererSettings())
     matcher = load_matcher(MatcherSettings(options.matcher, options.weights), renderer.device)
     values = {"max_image_width": options.max_width, "seed": options.seed, **options.set}
@@ -162,7 +161,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="replay", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    map_, matcher, localizer = MapSettings(), MatcherSettings(), LocalizerOptions()
+    matcher, localizer = MatcherSettings(), LocalizerOptions()
     parser.add_argument("bag", type=Path, help="folder of a rosbag2, or an .mcap or .db3 file")
     parser.add_argument("--map", type=Path, required=True, help="the Gaussian Splatting map")
     for option, types in (
@@ -203,13 +202,7 @@ def _parser() -> argparse.ArgumentParser:
         metavar="OPTION=VALUE",
         help=f"change an option of the localizer: {', '.join(localizer_options())}",
     )
-    finite = number(float, -math.inf)
-    frame = parser.add_argument_group("the map's frame", "as the node's parameters map.*")
-    frame.add_argument("--map-frame", default=map_.frame_id, metavar="NAME", help="default: %(default)s")
-    frame.add_argument("--map-scale", type=finite, default=map_.scale, metavar="S", help="default: %(default)s")
-    frame.add_argument("--map-translation", type=finite, nargs=3, default=map_.translation, metavar=("X", "Y", "Z"))
-    frame.add_argument("--map-rotation", type=finite, nargs=4, default=map_.rotation, metavar=("X", "Y", "Z", "W"))
-    frame.add_argument("--dataparser-transforms", default="", metavar="FILE", help="nerfstudio's")
+    add_map_options(parser)
     return parser
 
 

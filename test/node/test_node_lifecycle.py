@@ -64,8 +64,17 @@ def test_signal_while_busy_answers_the_requests_first(room_map_file, room_camera
         assert client.spin_until(lambda: all(request.done() for request in requests), 5.0)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("delay", [0.6, 1.5, 3.0])
+@pytest.mark.parametrize(
+    ("delay", "number"),
+    [
+        (0.6, signal.SIGINT),
+        (0.6, signal.SIGTERM),
+        (1.5, signal.SIGTERM),
+        (3.0, signal.SIGINT),
+        pytest.param(1.5, signal.SIGINT, marks=pytest.mark.nightly),
+        pytest.param(3.0, signal.SIGTERM, marks=pytest.mark.nightly),
+    ],
+)
 def test_signal_during_the_start_ends_it_cleanly(room_map_file, number, delay):
     process = NodeProcess(*node_arguments(map__path=room_map_file, matcher__name="sift"))
     try:

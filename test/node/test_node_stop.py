@@ -7,7 +7,7 @@ import signal
 import numpy as np
 import rclpy
 from lifecycle_msgs.srv import ChangeState, GetState
-from node_harness import TIMEOUT, Client, assert_answer, connected_client, running_localizer, send_inputs
+from node_harness import TIMEOUT, Client, assert_answer, connected_client, running_localizer, send_inputs, settle
 
 from gsfeatloc_ros.client.messages import camera_info_of, pose_with_covariance, rgb_image
 
@@ -90,6 +90,9 @@ def test_clean_up_while_requests_wait(room_map_file, room_camera, room_photos):
     photo = room_photos[0]
     with running_localizer(map__path=room_map_file, matcher__name="sift") as localizer, connected_client() as client:
         send_good(client, room_camera, photo)
+        changer = client.node.create_client(ChangeState, "localizer/change_state")
+        assert client.spin_until(changer.service_is_ready)
+        settle(client)
         futures = [client.send_request() for _ in range(3)]
 
         def change(number: int) -> rclpy.Future:
@@ -97,8 +100,6 @@ def test_clean_up_while_requests_wait(room_map_file, room_camera, room_photos):
             request.transition.id = number
             return changer.call_async(request)
 
-        changer = client.node.create_client(ChangeState, "localizer/change_state")
-        assert client.spin_until(changer.service_is_ready)
         futures += [change(4), change(2)]
         assert client.spin_until(lambda: futures[-1].done() and futures[-2].done(), TIMEOUT), localizer.output
         assert futures[-1].result().success

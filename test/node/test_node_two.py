@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
-from node_harness import RESEND_PERIOD, TIMEOUT, NodeProcess, node_arguments
+from node_harness import RESEND_PERIOD, TIMEOUT, NodeProcess, node_arguments, settle
 from sensor_msgs.msg import CameraInfo, Image
 from std_srvs.srv import Trigger
 
@@ -83,6 +83,8 @@ class Robots(ClientNode):
             )
         )
         assert found, "the localizers were not discovered"
+        for name in ALIGNMENTS:
+            settle(self, f"/{name}/localizer")
 
     def send(self, name: str, topic: str, message: object) -> None:
         self._publishers[name, topic].publish(message)

@@ -64,7 +64,7 @@ def test_without_an_answer_it_stays_lost(tmp_path):
     assert not any("status" in entry for entry in did["log"])
 
 
-@pytest.fixture(scope="module", params=[0, 1])
+@pytest.fixture(scope="module", params=[0, pytest.param(1, marks=pytest.mark.nightly)])
 def journey_made(request, localizer, tmp_path_factory):
     """Seed of the journey, and what the stack did on it."""
     status, did = run_stack(tmp_path_factory.mktemp("slam") / "slam.json", "--seed", str(request.param))

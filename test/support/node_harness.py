@@ -41,8 +41,8 @@ from gsfeatloc_ros.simulate import SimulatedPhoto
 
 # How long to listen before saying that nothing was published.
 SILENCE = 1.0
-# Whom a client has found may take so long to find the client too: what is sent before that is lost.
-SETTLING = 0.5
+# An answer comes within this, if the localizer knows whom to send it to.
+ANSWER_PERIOD = 0.5
 # Best effort may lose an image: it is sent again after this.
 RESEND_PERIOD = 3.0
 
@@ -108,6 +108,23 @@ def assert_start_fails(says: str, **parameters: object) -> None:
         localizer.end()
 
 
+def settle(client: ClientNode, node: str = "localizer") -> None:
+    """Wait until a node has found all that the client made until now: what is sent to it before that is lost.
+
+    A participant tells of its endpoints in the order in which they were made. That a service answers to one made only
+    now shows that those made before are known as well; asking again and again for nothing does no harm.
+    """
+    service = client.node.create_client(GetParameters, f"{node}/get_parameters")
+    try:
+        assert client.spin_until(service.service_is_ready), f"there is no node {node}"
+        for _ in range(int(TIMEOUT / ANSWER_PERIOD)):
+            if client.spin_until(service.call_async(GetParameters.Request()).done, ANSWER_PERIOD):
+                return
+        raise AssertionError(f"{node} does not answer")
+    finally:
+        client.node.destroy_client(service)
+
+
 class Client(ClientNode):
     """A camera and a robot's state estimator, as the localizer sees them, that remember what it published."""
 
@@ -145,6 +162,7 @@ class Client(ClientNode):
             )
         )
         assert found, "the localizer was not discovered"
+        settle(self)
 
     def listen_to_renders(self) -> None:
         self.node.create_subscription(Image, "rendered_image", self.renders.append, 5)
@@ -161,7 +179,7 @@ class Client(ClientNode):
             self._publishers[topic] = self.node.create_publisher(message_type, topic, 10)
             heard = self.spin_until(lambda: self._publishers[topic].get_subscription_count() > 0)
             assert heard, f"nobody listens to {topic}"
-            self.spin(SETTLING)
+            settle(self)
         return self._publishers[topic]
 
     def publish(self, topic: str, message: object) -> None:
@@ -170,11 +188,11 @@ class Client(ClientNode):
         self.spin(0.2)
 
     def call(self, service_type: type, name: str, request: object, timeout: float = TIMEOUT) -> object:
-        """What a service answers."""
+        """What a service of a node answers; its name is that of the node, a slash, and its own."""
         if name not in self._services:
             self._services[name] = self.node.create_client(service_type, name)
             assert self.spin_until(self._services[name].service_is_ready), f"there is no service {name}"
-            self.spin(SETTLING)
+            settle(self, name.rpartition("/")[0])
         assert self.spin_until(self._services[name].service_is_ready), f"there is no service {name} any more"
         future = self._services[name].call_async(request)
         assert self.spin_until(future.done, timeout), f"no answer from {name}"

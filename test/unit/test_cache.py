@@ -226,3 +226,17 @@ def test_header_that_claims_much_takes_no_memory(map_file, caplog):
     path.write_bytes(content[: start - 4] + len(encoded).to_bytes(4, "little") + encoded + content[start + length :])
     load_prepared(map_file)
     assert "is truncated" in caplog.text
+
+
+def test_content_is_that_of_a_copy_and_not_of_another_map(map_file, tmp_path) -> None:
+    copy, other = tmp_path / "copy.ply", tmp_path / "other.ply"
+    copy.write_bytes(map_file.read_bytes())
+    write_ply(other, two_rooms(1000, seed=1))
+    assert cache.map_content(map_file) == cache.map_content(copy)
+    assert cache.map_content(map_file) != cache.map_content(other)
+
+
+@pytest.mark.parametrize("name", ["map.ply", "a/map.ply", "meta.json", "."])
+def test_nothing_has_no_content(tmp_path, name: str) -> None:
+    with pytest.raises(MapError, match="cannot be read"):
+        cache.map_content(tmp_path / "empty" / name)

@@ -53,7 +53,8 @@ from gsfeatloc_ros.localize.evidence import Evidence, Limits
 from gsfeatloc_ros.localize.localizer import Localizer
 from gsfeatloc_ros.localize.options import LocalizerOptions
 from gsfeatloc_ros.localize.protection import protection_level
-from gsfeatloc_ros.match import Features, Matches, create_matcher
+from gsfeatloc_ros.localize.query import Components
+from gsfeatloc_ros.match import Features, Matches, create_matcher, create_tracker
 from gsfeatloc_ros.render import Render, create_renderer
 
 CAMERA = Camera(320, 240, np.array([[300.0, 0, 160], [0, 300.0, 120], [0, 0, 1]]))
@@ -283,7 +284,7 @@ class GivenDepth:
             depth_std=np.zeros(shape, np.float32),
             alpha=np.ones(shape, np.float32),
         )
-        self.device = "cpu"
+        self.device, self.solid_points = "cpu", np.empty((0, 3))
 
     def render(self, camera, T_map_camera):
         return self._render
@@ -560,9 +561,10 @@ def test_every_ablation_makes_a_difference(ablation, room_map, room_camera, room
     photo, matcher = room_photos[0], create_matcher("sift")
     renderer = create_renderer(room_map)
     options = LocalizerOptions(limits=Limits(max_risk=1.0), max_passes=1)
+    components = Components(renderer, matcher, create_tracker, options)
 
     def answer(taken_out):
-        localizer = ablated_localizer(renderer, matcher, options, taken_out)
+        localizer = ablated_localizer(components, taken_out)
         return localizer.localize(photo.image, room_camera, photo.T_map_camera_prior)
 
     whole, part = answer(""), answer(ablation)
@@ -588,5 +590,6 @@ def test_trackers_of_ablations_find_the_renders_corners_in_the_photo(ablation, r
 
 
 def test_an_ablation_that_is_not_known():
+    renderer, matcher = GivenDepth(np.ones((240, 320))), GivenMatches([], [])
     with pytest.raises(ValueError, match="ablation 'renderer' is not one of tracking, sub-pixel"):
-        ablated_localizer(GivenDepth(np.ones((240, 320))), GivenMatches([], []), LocalizerOptions(), "renderer")
+        ablated_localizer(Components(renderer, matcher, create_tracker, LocalizerOptions()), "renderer")

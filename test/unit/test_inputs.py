@@ -267,6 +267,23 @@ def test_another_body_s_odometry_is_another_odometry():
     np.testing.assert_array_equal(asked(made, 105), np.eye(4))
 
 
+def test_rows_of_a_rolling_shutter_are_read_while_the_camera_moves():
+    made = inputs()
+    made.take(InputTopic.PRIOR, prior(100, np.eye(4)))
+    for step in range(21):  # it turns to the left by 0.5 rad/s
+        turned = make_pose(so3_exp(np.array([0, 0, 0.025 * step])), np.zeros(3))
+        made.take(InputTopic.ODOMETRY, odometry(99.5 + 0.05 * step, turned))
+    assert made.for_image(image(100)).camera.readout is None
+    made.line_delay = 0.001
+    # Six rows. Left is the camera's -x, and up its -y; it is carried along, 0.3 m ahead of the base.
+    np.testing.assert_allclose(
+        made.for_image(image(100)).camera.readout, 0.006 * np.array([-0.15, 0, 0, 0, -0.5, 0]), atol=1e-9
+    )
+    # Where nobody knows how it moves it is taken to stand still.
+    made.take(InputTopic.PRIOR, prior(105, np.eye(4)))
+    assert made.for_image(image(105)).camera.readout is None
+
+
 def answer(seconds: float, pose: np.ndarray, source: PriorSource = PriorSource.LAST_ANSWER) -> Prior:
     return Prior(source, round(seconds * SECOND), "map", False, pose, None)
 

@@ -17,7 +17,7 @@ from gsfeatloc_ros.localize.evidence import Limits
 from gsfeatloc_ros.localize.localizer import Localizer
 from gsfeatloc_ros.localize.options import LocalizerOptions
 from gsfeatloc_ros.match import create_matcher
-from gsfeatloc_ros.render import create_renderer
+from gsfeatloc_ros.render import Render, create_renderer
 
 
 @pytest.fixture(scope="module")
@@ -220,6 +220,28 @@ def test_a_blurred_photo_is_compared_with_a_render_blurred_alike(
     assert estimate.evidence.blur_px == pytest.approx(pixels, rel=0.35)
     assert rotation_error_deg(estimate.T_map_camera, photo.T_map_camera) < 1.0
     assert translation_error(estimate.T_map_camera, photo.T_map_camera) < 0.05
+
+
+class CountingRenderer:
+    """A renderer that remembers how wide its pictures were."""
+
+    def __init__(self, renderer) -> None:
+        self._renderer = renderer
+        self.device = renderer.device
+        self.widths: list[int] = []
+
+    def render(self, camera: Camera, T_map_camera: np.ndarray) -> Render:
+        self.widths.append(camera.width)
+        return self._renderer.render(camera, T_map_camera)
+
+
+@pytest.mark.parametrize("max_passes", [1, 2, 3])
+def test_renders_of_a_blurred_photo_are_counted(renderer, room_camera, room_photos, max_passes: int) -> None:
+    photo, counting = room_photos[0], CountingRenderer(renderer)
+    localizer = Localizer(counting, create_matcher("sift"), LocalizerOptions(max_passes=max_passes, max_views=0))
+    evidence = localizer.localize(motion(photo.image, 15), room_camera, photo.T_map_camera_prior).evidence
+    assert evidence.blur_px > 0
+    assert evidence.passes == counting.widths.count(640) <= max_passes
 
 
 @pytest.mark.slow

@@ -93,9 +93,10 @@ def test_table_counts_by_kind_and_poses_in_all():
 
 
 @pytest.mark.slow
-def test_tool_gives_no_negative_a_pose(scene_folder, tmp_path, capsys):
+@pytest.mark.parametrize("sigma", ["0.02", pytest.param("0.3", marks=pytest.mark.nightly)])
+def test_tool_gives_no_negative_a_pose(scene_folder, tmp_path, capsys, sigma):
     path = tmp_path / "negatives.json"
-    assert negatives.main([str(scene_folder), "--sigma", "0.3", "--limit", "1", "--json", str(path)]) == 0
+    assert negatives.main([str(scene_folder), "--sigma", sigma, "--limit", "1", "--json", str(path)]) == 0
     rows = json.loads(path.read_text())
     assert [(row["kind"], row["photo"]) for row in rows] == [
         ("mirrored", "0.png"),

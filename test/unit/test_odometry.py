@@ -41,6 +41,20 @@ def test_motion_between_any_two_times(start, end):
     assert np.abs(motion - expected).max() < 4e-4
 
 
+@given(seconds=st.floats(100.0, 110.1))
+def test_velocity_at_any_time_and_a_little_later(seconds):
+    velocity = filled(100.0, 110.0).velocity(round(seconds * SECOND))
+    # In its own axes the robot drives straight on; the chord is to the side by half of the turn between two poses.
+    np.testing.assert_allclose(velocity, [1, 0, 0, 0, 0, 0.5], atol=0.013)
+
+
+@pytest.mark.parametrize("outside", [99.7, 110.3])
+def test_velocity_is_not_known_outside_of_what_came(outside):
+    assert OdometryBuffer(60.0).velocity(0) is None
+    assert filled(100.0, 100.0).velocity(100 * SECOND) is None
+    assert filled(100.0, 110.0).velocity(round(outside * SECOND)) is None
+
+
 @pytest.mark.parametrize("outside", [99.7, 110.3])
 def test_nothing_is_known_outside_of_what_came(outside):
     odometry = filled(100.0, 110.0)

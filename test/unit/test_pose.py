@@ -125,6 +125,23 @@ def exact(pixels: np.ndarray, points: np.ndarray) -> Correspondences:
     return Correspondences(pixels, points, np.zeros_like(points))
 
 
+class CountingCamera(Camera):
+    """A camera that counts how often points are projected."""
+
+    projections = 0
+
+    def project(self, points: np.ndarray) -> np.ndarray:
+        type(self).projections += 1
+        return super().project(points)
+
+
+def test_the_errors_of_a_pose_are_computed_once() -> None:
+    found, _ = scene(0, outliers=0.3)
+    solution = solve_pose(CountingCamera(CAMERA.width, CAMERA.height, CAMERA.K), found, PoseOptions(), seed=0)
+    assert CountingCamera.projections == 1
+    np.testing.assert_array_equal(solution.errors, reprojection_errors(CAMERA, solution.T_map_camera, found))
+
+
 @settings(max_examples=30, deadline=None)
 @given(seed=st.integers(0, 2**31), outliers=st.floats(0, 0.6))
 def test_finds_the_pose_among_outliers(seed: int, outliers: float) -> None:

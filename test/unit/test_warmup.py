@@ -152,7 +152,7 @@ print(len(compilations.buffer))
 """
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_kernels_of_an_unwritable_install_are_compiled_once(unwritable_install, tmp_path, room_map_file):
     where = {"XDG_CACHE_HOME": str(tmp_path)}
     first, second = (run(unwritable_install, "-m", "gsfeatloc_ros.tools.warmup", **where) for _ in range(2))

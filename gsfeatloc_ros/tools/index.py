@@ -1,0 +1,106 @@
+"""Make the index of a map's views ahead of use, by which images without a prior are found.
+
+    python -m gsfeatloc_ros.tools.index room.ply
+    python -m gsfeatloc_ros.tools.index room.ply --poses SCENE --views 480 --matcher xfeat --out room.index
+
+Without --out it goes where the node looks for it: beside the map, or into the user's cache. The node, which makes one
+by itself where there is none, takes it as long as map, frame and matcher are those that it was made with.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from gsfeatloc_ros.common.kernel_cache import can_write
+from gsfeatloc_ros.evaluate.scene import load_poses
+from gsfeatloc_ros.index import IndexOptions, ViewIndex, build_index
+from gsfeatloc_ros.index.storage import index_path, save_index
+from gsfeatloc_ros.localize.engine import load_matcher, load_renderer
+from gsfeatloc_ros.localize.map_index import index_key
+from gsfeatloc_ros.localize.settings import MatcherSettings, RendererSettings
+from gsfeatloc_ros.match import MATCHERS
+from gsfeatloc_ros.render import DEVICES
+from gsfeatloc_ros.tools.options import add_map_options, map_settings, number
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command line; return the exit status.
+
+    It is 0 when the index was written, 1 when something cannot be used and 130 when the user interrupted it.
+    """
+    options = _parser().parse_args(arguments)
+    start = time.perf_counter()
+    try:
+        path, index = _make(options)
+    except (ValueError, RuntimeError, OSError) as error:  # a map, poses, weights or file that cannot be used
+        print(f"index: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("index: interrupted", file=sys.stderr)
+        return 130
+    size, seconds = path.stat().st_size / 1e6, time.perf_counter() - start
+    print(f"{path}: {len(index)} views, {len(index.codes)} features, {size:.1f} MB, {seconds:.1f} s")
+    return 0
+
+
+def _make(options: argparse.Namespace) -> tuple[Path, ViewIndex]:
+    """Make the index that the options ask for, and write it; return where it is."""
+    map_, matcher = map_settings(options), MatcherSettings(options.matcher, options.weights)
+    key, placed = index_key(map_.path, map_, matcher), map_.alignment()
+    path = options.out or index_path(map_.path)
+    # Now, not after minutes.
+    if path.is_dir() or not can_write(path.absolute().parent):
+        raise ValueError(f"{path}: cannot be written: name another file (--out)")
+    poses = None
+    if options.poses:
+        poses = np.array([placed.transform_pose(pose) for pose in load_poses(options.poses)])
+    renderer = load_renderer(map_, RendererSettings(options.device, options.threads))
+    features = load_matcher(matcher, renderer.device)
+    with tqdm(desc="views", unit="view", disable=None) as bar:
+
+        def progress(done: int, total: int) -> None:
+            bar.total = total
+            bar.update(done - bar.n)
+
+        settings = IndexOptions(views=options.views, seed=options.seed)
+        index = build_index(renderer, features, settings, progress, poses=poses)
+    save_index(path, index, key)
+    return path, index
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="index", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    index, matcher = IndexOptions(), MatcherSettings()
+    parser.add_argument("map", type=Path, metavar="MAP", help="the Gaussian Splatting map")
+    parser.add_argument(
+        "--poses",
+        type=Path,
+        metavar="SCENE",
+        help="poses that the map's photos were taken at, in the frame of its file, which are chosen from first: the "
+        "folder of a scene, as for evaluate, or a transforms.json",
+    )
+    parser.add_argument(
+        "--views", type=number(int, 1), default=index.views, metavar="N", help="their number (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--seed", type=number(int, 0), default=index.seed, metavar="S", help="another one gives other views"
+    )
+    parser.add_argument("--matcher", choices=sorted(MATCHERS), default=matcher.name, help="default: %(default)s")
+    parser.add_argument("--weights", default="", metavar="PATH", help="of a learned matcher, as matcher.weights")
+    parser.add_argument("--device", choices=DEVICES, default="auto", help="to render on (default: %(default)s)")
+    parser.add_argument("--threads", type=number(int, 0), default=0, help="CPU threads; 0 for one per core")
+    parser.add_argument("--out", type=Path, metavar="FILE", help="the index (default: where the node looks for it)")
+    add_map_options(parser)
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())
