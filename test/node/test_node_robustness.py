@@ -106,12 +106,19 @@ def test_publisher_is_killed_and_another_one_starts(client, room_camera, photo, 
 
 @pytest.mark.parametrize("jump", [[100.0, 0.0, 0.0], [0.0, -100.0, 0.0], [0.0, 0.0, 100.0]])
 def test_prior_jumps_100_m(client, room_camera, photo, jump):
-    """It says where to look first, and no more."""
+    """Never a wrong pose: the right one, or none that is so far from what was claimed."""
     send_inputs(client, room_camera, photo)
     assert_answer(client, photo)
     far = photo.T_map_camera_prior.copy()
     far[:3, 3] += jump
     client.send_prior(pose_stamped(far))
+    image = rgb_image(photo.image)
+    said = client.attempt(image)
+    if said.ok:
+        assert_close(client.pose_of(image), photo.T_map_camera)
+    else:
+        assert "standard deviations from the prior" in said.reason
+    client.send_prior(pose_stamped(photo.T_map_camera_prior))
     assert_answer(client, photo)
 
 
