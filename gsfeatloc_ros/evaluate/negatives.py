@@ -197,16 +197,17 @@ def localize_negatives(
 
 def negative_table(results: Sequence[NegativeResult]) -> str:
     """Return a table with a line for every matcher, scene and kind of photo; the last line has the number of poses."""
-    lines = ["matcher            scene      photos of    photos accepted rejected failed  CPU-s"]
+    lines = ["matcher            scene      photos of    photos accepted ambiguous rejected failed  CPU-s"]
     groups: dict[tuple[str, str, str], list[NegativeResult]] = {}
     for result in results:
         groups.setdefault((result.matcher, result.scene, result.kind), []).append(result)
     for (matcher, scene, kind), group in groups.items():
         statuses = [result.estimate.status for result in group]
-        accepted, rejected, failed = (statuses.count(status) for status in Status)
+        counts = {status: statuses.count(status) for status in Status}
         seconds = median(result.cpu_seconds for result in group)
         lines.append(
-            f"{matcher:18} {scene:10} {kind:12} {len(group):6} {accepted:8} {rejected:8} {failed:6}  {seconds:.2f}"
+            f"{matcher:18} {scene:10} {kind:12} {len(group):6} {counts[Status.LOCALIZED]:8} "
+            f"{counts[Status.AMBIGUOUS]:9} {counts[Status.REJECTED]:8} {counts[Status.FAILED]:6}  {seconds:.2f}"
         )
     accepted = sum(result.estimate.localized for result in results)
     lines.append(f"accepted {accepted} of {len(results)}")

@@ -87,8 +87,8 @@ def test_a_row_has_all_of_the_evidence():
 def test_table_counts_by_kind_and_poses_in_all():
     results = [result(Status.FAILED), result(Status.REJECTED), result(Status.FAILED, seconds=3.0)]
     lines = negative_table([*results, result(Status.LOCALIZED, "black")]).splitlines()
-    assert lines[1].split() == ["sift", "room", "noise", "3", "0", "1", "2", "1.00"]
-    assert lines[2].split() == ["sift", "room", "black", "1", "1", "0", "0", "1.00"]
+    assert lines[1].split() == ["sift", "room", "noise", "3", "0", "0", "1", "2", "1.00"]
+    assert lines[2].split() == ["sift", "room", "black", "1", "1", "0", "0", "0", "1.00"]
     assert lines[3] == "accepted 1 of 4"
 
 
