@@ -20,6 +20,8 @@ _MIN_VARIANCE_SHARE = 0.01
 # standard deviation.
 _MAX_FOCAL_ERROR = 0.01
 _FOCAL_SIGMAS = 2.0
+# Of a pose that no prior expects so many times the risk is taken: a mirror image, or a wall seen from behind, is one.
+_UNEXPECTED = 0.01
 # The weights of what tells right from wrong answers (docs/trust.md), and what their sum is shifted and scaled by to be
 # the logarithm of the odds that the answer is wrong. Ratios count by their logit, correlations by Fisher's z.
 _WEIGHTS = {"inlier_ratio": -1.11, "render_inlier_ratio": -1.61, "correlation": -5.03, "low_correlation": -2.22}
@@ -114,9 +116,13 @@ class Limits:
     min_coverage: float = parameter(
         0.1, "With inliers in a smaller share of the image's 8 x 6 cells there is no answer.", (0.0, 1.0), live=True
     )
-    # A wall seen from behind can match well; such poses are far from the prior.
+    # A wall seen from behind can match well; such poses are far from the prior. But priors may claim more than they
+    # know.
     max_deviation: float = parameter(
-        8.0, "Farther than this many standard deviations from the prior there is no answer.", (0.1, 1e6), live=True
+        8.0,
+        "Farther than this many standard deviations from the prior, or without one, a hundredth of max_risk is taken.",
+        (0.1, 1e6),
+        live=True,
     )
 
 
@@ -134,21 +140,26 @@ def verdict(evidence: Evidence, limits: Limits) -> tuple[str, ...]:
     if evidence.inliers < limits.min_inliers:
         reasons.append(f"{evidence.counts} (at least {limits.min_inliers} needed)")
     # Written so that NaN is a reason.
-    if not evidence.probability_wrong <= limits.max_risk:
+    expected = evidence.deviation <= limits.max_deviation
+    max_risk = limits.max_risk * (1.0 if expected else _UNEXPECTED)
+    if not evidence.probability_wrong <= max_risk:
+        why = _unexpected(evidence, limits)
         reasons.append(
-            f"it is wrong with a probability of {evidence.probability_wrong:.1g} (at most {limits.max_risk:g}): "
+            f"it is wrong with a probability of {evidence.probability_wrong:.1g} (at most {max_risk:g}{why}): "
             f"{evidence.inlier_ratio:.0%} of the photo's corners and {evidence.render_inlier_ratio:.0%} of the "
             f"render's agree, there with a correlation of {evidence.correlation:.2f}; {evidence.changed:.0%} of the "
             f"photo is not as in the map; {evidence.counts}"
         )
     if evidence.coverage < limits.min_coverage:
         reasons.append(f"inliers in {evidence.coverage:.0%} of the photo (at least {limits.min_coverage:.0%} needed)")
-    if evidence.deviation > limits.max_deviation:
-        reasons.append(
-            f"the pose is {evidence.deviation:.1f} standard deviations from the prior "
-            f"(at most {limits.max_deviation:g})"
-        )
     return tuple(reasons)
+
+
+def _unexpected(evidence: Evidence, limits: Limits) -> str:
+    """Return in words why less risk is taken with a pose; nothing for one that the prior expects."""
+    if evidence.deviation > limits.max_deviation:
+        return f", for the pose is {evidence.deviation:.1f} standard deviations from the prior"
+    return "" if evidence.deviation <= limits.max_deviation else " without a prior"
 
 
 def focal_length_is_wrong(evidence: Evidence) -> bool:

@@ -22,7 +22,7 @@ class SearchOptions:
         3.0, "Longest search of the index, in seconds; what was begun by then is ended.", (0.0, 3600.0), live=True
     )
     max_views: int = parameter(
-        40, "Most views of the index that are compared with an image; 0 for none.", (0, 1_000_000), live=True
+        100, "Most views of the index that are compared with an image; 0 for none.", (0, 1_000_000), live=True
     )
 
 

@@ -14,11 +14,13 @@ from gsfeatloc_ros.pose.solve import Correspondences, ransac_pose
 
 # Matches of a small photo with a view agree with a pose within so many pixels.
 _MAX_ERROR = 4.0
+# Samples of RANSAC: enough for one right match in eight.
+_MAX_ITERATIONS = 2_000
 # A view whose pose a prior holds for possible counts so many times as much as another that as much speaks for.
 _WEIGHT_OF_PRIOR = 3.0
 # The neighbours of a view, itself included, are looked for among so many that most speaks for.
 _NEIGHBOURS = 6
-_MAX_RANKED = 60
+_MAX_RANKED = 100
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +82,9 @@ class _Group:
         pairs = [self._match(int(other)) for other in dict.fromkeys([view, *beside.tolist()])]
         pixels, points = np.concatenate([m.a for m, _ in pairs]), np.concatenate([p for _, p in pairs])
         found = Correspondences(pixels, points, np.zeros_like(points))
-        solved = ransac_pose(self._small.photo.camera, found, _MAX_ERROR, self._small.components.options.seed)
+        solved = ransac_pose(
+            self._small.photo.camera, found, _MAX_ERROR, self._small.components.options.seed, _MAX_ITERATIONS
+        )
         # A pixel that several views know counts once.
         return None if solved is None else (solved[0], len(np.unique(pixels[solved[1]], axis=0)))
 

@@ -30,7 +30,7 @@ _BATCH = 8
 # Fewer matches with a view of the index suggest a pose: the map is rendered there to confirm it.
 _MIN_INDEX_HINT = 6
 # Of what the index suggested, so many are followed once all its views were compared.
-_MAX_FOLLOWED_HINTS = 6
+_MAX_FOLLOWED_HINTS = 12
 # Another pose is looked at if so many times as many matches agree with it, in views of so many times as many votes.
 _RIVAL_SHARE = 0.5
 _MAX_RIVALS = 3

@@ -144,11 +144,12 @@ def _solve(
 
 
 def ransac_pose(
-    camera: Camera, found: Correspondences, max_error: float, seed: int
+    camera: Camera, found: Correspondences, max_error: float, seed: int, max_iterations: int = _MAX_ITERATIONS
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Run LO-RANSAC with P3P: return the pose T_map_camera (4, 4) and its inliers (M,) bool, or None.
 
-    `max_error` is the reprojection error in pixels up to which a match is an inlier; the others as in `solve_pose`.
+    `max_error` is the reprojection error in pixels up to which a match is an inlier, `max_iterations` the most samples
+    that are drawn; the others as in `solve_pose`.
     """
     if len(found.pixels) < MIN_POINTS:
         return None
@@ -161,7 +162,7 @@ def ransac_pose(
     ransac = {
         "max_reproj_error": max_error,
         "min_iterations": _MIN_ITERATIONS,
-        "max_iterations": _MAX_ITERATIONS,
+        "max_iterations": max_iterations,
         "seed": seed,
     }
     pose, info = poselib.estimate_absolute_pose(found.pixels, found.points, pinhole, ransac, {})

@@ -45,7 +45,6 @@ def test_good_evidence_has_nothing_against_it() -> None:
         ("inliers", 30, 29, "at least 30 needed"),
         ("probability_wrong", 1e-4, 1.01e-4, "wrong with a probability of 0.0001 (at most 0.0001)"),
         ("coverage", 0.1, 0.0999, "at least 10% needed"),
-        ("deviation", 8.0, 8.0001, "standard deviations from the prior (at most 8)"),
         ("focal_error", 0.016, 0.0161, "the focal length fits 1.6 +- 0.3 % longer than calibrated"),
         ("focal_error", -0.016, -0.0161, "the focal length fits 1.6 +- 0.3 % shorter than calibrated"),
     ],
@@ -56,8 +55,23 @@ def test_each_limit_is_exact_and_named(name: str, limit: float, beyond: float, s
     assert says in reason
 
 
+@pytest.mark.parametrize(
+    ("deviation", "says"),
+    [(8.0001, ", for the pose is 8.0 standard deviations from the prior"), (float("nan"), " without a prior")],
+)
+def test_a_pose_that_no_prior_expects_must_be_a_hundred_times_surer(deviation: float, says: str) -> None:
+    sure = replace(GOOD, probability_wrong=1e-6, deviation=deviation)
+    assert verdict(sure, Limits()) == ()
+    unsure = replace(sure, probability_wrong=1.01e-6)
+    (reason,) = verdict(unsure, Limits())
+    assert f"(at most 1e-06{says})" in reason
+    assert verdict(replace(unsure, deviation=8.0), Limits()) == ()
+
+
 def test_limits_are_those_that_are_given() -> None:
-    assert len(verdict(GOOD, Limits(max_risk=1e-10, min_inliers=600, min_coverage=0.9, max_deviation=1.0))) == 4
+    limits = Limits(max_risk=1e-8, min_inliers=600, min_coverage=0.9)
+    assert len(verdict(GOOD, limits)) == 2
+    assert len(verdict(GOOD, replace(limits, max_deviation=1.0))) == 3
 
 
 def test_no_inliers_are_the_only_reason() -> None:

@@ -39,7 +39,7 @@ def matcher():
 
 @pytest.fixture(scope="module")
 def index(renderer, matcher) -> ViewIndex:
-    return build_index(renderer, matcher, IndexOptions(views=15))
+    return build_index(renderer, matcher, IndexOptions(views=30))
 
 
 # Made
@@ -52,8 +52,8 @@ def test_a_photo_without_a_prior_is_localized(renderer, matcher, index, room_cam
         assert estimate.status is Status.LOCALIZED, estimate.reason
         assert rotation_error_deg(estimate.T_map_camera, photo.T_map_camera) < 1.0
         assert translation_error(estimate.T_map_camera, photo.T_map_camera) < 0.02
-        assert estimate.evidence.index_views == len(index) == 15
-        assert 0 < estimate.evidence.searched <= 15
+        assert estimate.evidence.index_views == len(index) == 30
+        assert 0 < estimate.evidence.searched <= 30
         assert np.isnan(estimate.evidence.deviation)
 
 
@@ -61,7 +61,7 @@ def test_a_photo_of_nothing_in_the_map_is_not(renderer, matcher, index, room_cam
     noise = np.random.default_rng(0).integers(0, 256, (480, 640, 3), dtype=np.uint8)
     estimate = Localizer(renderer, matcher, index=index).localize(noise, room_camera)
     assert estimate.status is Status.FAILED
-    assert "15 of 15 views of the map" in estimate.reason
+    assert "30 of 30 views of the map" in estimate.reason
 
 
 def test_points_of_views_are_on_what_they_show(room, index) -> None:

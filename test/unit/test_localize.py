@@ -139,11 +139,22 @@ def test_mirrored_photos_are_rejected(localizer, room_camera, room_photos) -> No
         assert_no_answer(localizer.localize(mirrored, room_camera, photo.T_map_camera))
 
 
-def test_an_answer_far_from_the_prior_is_rejected(sift_localizer, room_camera, room_photos) -> None:
-    """The prior is 0.3 m and 10 degrees off at least, and says that it knows better."""
+def test_a_prior_that_knows_better_does_not_veto_what_is_seen(sift_localizer, room_camera, room_photos) -> None:
+    """The prior is 0.3 m and 10 degrees off at least, and claims to be sure."""
     photo = room_photos[0]
-    sure = np.diag([1e-6] * 6)
-    estimate = sift_localizer.localize(photo.image, room_camera, photo.T_map_camera_prior, sure)
+    estimate = sift_localizer.localize(photo.image, room_camera, photo.T_map_camera_prior, np.diag([1e-6] * 6))
+    assert estimate.evidence.deviation > 8
+    assert estimate.localized
+    assert translation_error(estimate.T_map_camera, photo.T_map_camera) < 0.02
+
+
+def test_less_risk_is_taken_where_no_prior_expects_the_pose(renderer, sift_localizer, room_camera, room_photos) -> None:
+    photo = room_photos[0]
+    near = sift_localizer.localize(photo.image, room_camera, photo.T_map_camera_prior)
+    limits = Limits(max_risk=10 * near.evidence.probability_wrong)
+    localizer = Localizer(renderer, create_matcher("sift"), LocalizerOptions(limits=limits))
+    assert localizer.localize(photo.image, room_camera, photo.T_map_camera_prior).localized
+    estimate = localizer.localize(photo.image, room_camera, photo.T_map_camera_prior, np.diag([1e-6] * 6))
     assert estimate.status is Status.REJECTED
     assert "standard deviations from the prior" in estimate.reason
 
