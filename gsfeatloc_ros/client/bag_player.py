@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,6 +13,7 @@ from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from rclpy.serialization import deserialize_message
 from rosbags.rosbag2 import Reader
 from sensor_msgs.msg import CameraInfo, Image
+from std_srvs.srv import Empty
 
 from gsfeatloc_ros.client.client_node import ClientNode
 from gsfeatloc_ros.client.messages import pose_matrix, read_diagnostics, stamp_of
@@ -88,6 +89,40 @@ def play_bag(
         player.close()
 
 
+def play_lost(
+    path: str | Path,
+    topics: Topics,
+    photos: Collection[int],
+    is_running: Callable[[], bool],
+    reply_timeout: float = 30.0,
+) -> Iterator[Reply]:
+    """Publish some photos of a bag without priors, to a localizer that is told before each that it is lost.
+
+    Args:
+        photos: numbers of the photos in the bag, from 0 on.
+        path, topics, is_running, reply_timeout: as for play_bag.
+
+    Raises:
+        RuntimeError: the localizer ended.
+        TimeoutError: the localizer did not appear on its topics, or did not hear that it is lost.
+    """
+    player = _Player(topics, is_running)
+    try:
+        player.wait_for_localizer(START_TIMEOUT)
+        with Reader(path) as bag:
+            played = [c for c in bag.connections if c.topic in (topics.image, topics.camera_info)]
+            number = -1
+            for connection, _, cdr in bag.messages(played):
+                number += connection.topic == topics.image
+                if connection.topic == topics.camera_info:
+                    player.publishers[connection.topic].publish(bytes(cdr))
+                elif number in photos:
+                    player.lose(reply_timeout)
+                    yield player.localize(bytes(cdr), reply_timeout)
+    finally:
+        player.close()
+
+
 class _Player(ClientNode):
     """A node that publishes the topics of a bag and remembers what the localizer says."""
 
@@ -98,6 +133,7 @@ class _Player(ClientNode):
         self._evidence: dict[str, dict[str, str]] = {}
         types = {topics.image: Image, topics.camera_info: CameraInfo, topics.prior: PoseStamped}
         self.publishers = {topic: self.node.create_publisher(kind, topic, 10) for topic, kind in types.items()}
+        self._lose = self.node.create_client(Empty, "reinitialize_global_localization")
         self._subscriptions = (
             self.node.create_subscription(PoseWithCovarianceStamped, "pose", self._on_pose, LATCHED),
             self.node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 100),
@@ -116,6 +152,14 @@ class _Player(ClientNode):
             raise TimeoutError(f"no localizer on {', '.join(self.publishers)} within {timeout:g} s")
         # It may take a moment longer to find us, and would miss the first camera info: that is sent with best effort.
         time.sleep(_SETTLING)
+
+    def lose(self, timeout: float) -> None:
+        """Tell the localizer that it is lost."""
+        lost = (
+            self._lose.call_async(Empty.Request()) if self._wait_until(self._lose.service_is_ready, timeout) else None
+        )
+        if lost is None or not self._wait_until(lost.done, timeout):
+            raise TimeoutError(f"no answer from {self._lose.srv_name} within {timeout:g} s")
 
     def localize(self, cdr: bytes, timeout: float) -> Reply:
         """Publish a serialized photo and wait for what the localizer says to it."""

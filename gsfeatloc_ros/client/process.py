@@ -14,6 +14,8 @@ from signal import SIGINT, Signals
 
 from ament_index_python.packages import get_package_prefix, get_package_share_directory
 
+# What the localizer writes when images need no prior any more.
+INDEX_READY = "the view index is ready"
 # Seconds. Generous: the first start on a machine compiles kernels, and CI machines are slow and shared.
 START_TIMEOUT = 180.0
 # Seconds that the localizer may take to leave after a signal; with less, a localization may still be under way.

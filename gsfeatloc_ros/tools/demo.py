@@ -1,7 +1,8 @@
 """Localize a camera in a simulated room, from start to end over ROS.
 
 Builds a room, its Gaussian Splatting map and a bag of photos with rough priors, starts the installed `localizer`, plays
-the bag into it, and compares its answers with the truth. Exits with 0 when at least 95 % of the photos are localized
+the bag into it, and compares its answers with the truth. Then the camera is kidnapped: some photos come without a prior
+from anywhere in the room. Exits with 0 when at least 95 % of the photos with priors, and all without, are localized
 within 1 degree and 2 cm.
 
     python -m gsfeatloc_ros.tools.demo --matcher xfeat --photos 40
@@ -12,15 +13,15 @@ from __future__ import annotations
 import argparse
 import shutil
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from gsfeatloc_ros.client.bag_player import Topics, play_bag
-from gsfeatloc_ros.client.process import isolate_ros, running_localizer
+from gsfeatloc_ros.client.bag_player import Reply, Topics, play_bag, play_lost
+from gsfeatloc_ros.client.process import INDEX_READY, START_TIMEOUT, isolate_ros, running_localizer
 from gsfeatloc_ros.client.score import MAX_ROTATION_ERROR_DEG, MAX_TRANSLATION_ERROR, Score, draw_scores, score
 from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.maps.ply import write_ply
@@ -38,6 +39,7 @@ TOPICS = Topics(IMAGE_TOPIC, CAMERA_INFO_TOPIC, PRIOR_TOPIC)
 _K = [[500.0, 0.0, 322.0], [0.0, 502.0, 236.0], [0.0, 0.0, 1.0]]
 _CAMERA = Camera(640, 480, np.array(_K), np.array([-0.28, 0.09, 0.0008, -0.0005, 0.0]))
 _PICTURE_ROWS = 4
+_KIDNAPPINGS = 5
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -58,8 +60,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     parameters = {"map.path": map_file.resolve(), "matcher.name": args.matcher}
     try:
         with running_localizer(parameters, asdict(TOPICS), log) as localizer:
-            print(f"localizer: started with {args.matcher}, its log in {log}\n", flush=True)
-            scores = _play(bag, photos, lambda: localizer.alive)
+            print(f"localizer: started with {args.matcher}, its log in {log}", flush=True)
+            localizer.wait_for_output(INDEX_READY, START_TIMEOUT)
+            print("localizer: knows what the room looks like from anywhere\n", flush=True)
+            scores = _play(photos, play_bag(bag, TOPICS, lambda: localizer.alive))
+            print("\nkidnapped: it is told that it is lost, and sees another place without a prior", flush=True)
+            places = range(0, len(photos), -(-len(photos) // _KIDNAPPINGS))
+            lost = _play([photos[i] for i in places], play_lost(bag, TOPICS, places, lambda: localizer.alive))
     except (RuntimeError, TimeoutError) as error:
         print(f"demo: {error}; see {log}", file=sys.stderr)
         return 1
@@ -68,7 +75,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     cv2.imwrite(str(picture), draw_scores(scores, _CAMERA, create_renderer(room_map), _PICTURE_ROWS)[:, :, ::-1])
     print(f"\nphoto | render at the prior | render at the estimate: {picture}")
     print(summary(scores))
-    return 0 if sum(each.success for each in scores) >= MIN_SUCCESS_RATE * len(scores) else 1
+    print(f"without a prior: {summary(lost)}")
+    found = sum(each.success for each in scores) >= MIN_SUCCESS_RATE * len(scores)
+    return 0 if found and all(each.success for each in lost) else 1
 
 
 def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
@@ -85,11 +94,11 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     return args
 
 
-def _play(bag: Path, photos: Sequence[SimulatedPhoto], is_running: Callable[[], bool]) -> list[Score]:
-    """Play the bag and print a line for each photo."""
+def _play(photos: Sequence[SimulatedPhoto], replies: Iterable[Reply]) -> list[Score]:
+    """Print a line for the reply to each photo."""
     print("photo         prior error          final error   inliers      ms", flush=True)
     scores = []
-    for photo, reply in zip(photos, play_bag(bag, TOPICS, is_running), strict=True):
+    for photo, reply in zip(photos, replies, strict=True):
         scores.append(score(photo, reply))
         print(row(len(scores), scores[-1]), flush=True)
     return scores

@@ -21,8 +21,9 @@ def test_demo_localizes_photos_of_a_bag(tmp_path):
     done = subprocess.run([*command, "--out", tmp_path], capture_output=True, text=True, timeout=400)
     assert done.returncode == 0, done.stdout + done.stderr
     lines = done.stdout.splitlines()
-    assert sum(line.split()[:1] in (["1"], ["2"], ["3"]) for line in lines) == 3
-    assert lines[-1].startswith("localized 3 of 3 (100 %) within 1 degree and 2 cm; median error 0.")
+    assert sum(line.split()[:1] in (["1"], ["2"], ["3"]) for line in lines) == 3 + 3
+    assert lines[-2].startswith("localized 3 of 3 (100 %) within 1 degree and 2 cm; median error 0.")
+    assert lines[-1].startswith("without a prior: localized 3 of 3 (100 %) within 1 degree and 2 cm; median error 0.")
     assert cv2.imread(str(tmp_path / "photos.png")).shape[1] > 3 * 640
     assert "ready" in (tmp_path / "localizer.log").read_text()
 

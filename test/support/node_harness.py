@@ -64,7 +64,7 @@ class NodeProcess(process.LocalizerProcess):
 
     def wait_for_index(self) -> None:
         """Wait until it finds images without a prior."""
-        super().wait_for_output("the view index is ready", process.START_TIMEOUT)
+        super().wait_for_output(process.INDEX_READY, process.START_TIMEOUT)
 
     def wait(self, timeout: float = TIMEOUT) -> int:
         return super().wait(timeout)
