@@ -192,7 +192,7 @@ class Client(ClientNode):
         if name not in self._services:
             self._services[name] = self.node.create_client(service_type, name)
             assert self.spin_until(self._services[name].service_is_ready), f"there is no service {name}"
-            settle(self, name.rpartition("/")[0])
+            settle(self, name.rpartition("/")[0] or "localizer")
         assert self.spin_until(self._services[name].service_is_ready), f"there is no service {name} any more"
         future = self._services[name].call_async(request)
         assert self.spin_until(future.done, timeout), f"no answer from {name}"
