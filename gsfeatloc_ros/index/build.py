@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 from gsfeatloc_ros.common.arrays import to_host
 from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.stage_clock import Interrupted
+from gsfeatloc_ros.index.look_alikes import find_look_alikes
 from gsfeatloc_ros.index.options import IndexOptions
 from gsfeatloc_ros.index.placement import CELL, cells, cover, radius, random_poses, seen_cells
 from gsfeatloc_ros.index.view_index import ViewIndex
@@ -89,11 +90,12 @@ def build_index(
     chosen = cover([view.confirmed_cells() for view in views], options.views, first)
     progress(total, total)
     kept = [views[view] for view in chosen]
-    return ViewIndex.compress(
+    index = ViewIndex.compress(
         np.array([view.pose for view in kept]).reshape(-1, 4, 4),
         [view.descriptors[view.confirmed] for view in kept] or [np.empty((0, 1))],
         [view.points[view.confirmed] for view in kept] or [np.empty((0, 3))],
     )
+    return replace(index, look_alikes=find_look_alikes(index, _camera(*_VIEW)))
 
 
 @dataclass(eq=False)
