@@ -6,6 +6,7 @@
     python -m gsfeatloc_ros.tools.benchmark opensplat --map map.ply --checkout OpenSplat
     python -m gsfeatloc_ros.tools.benchmark query --scene SCENE --matcher xfeat --json query.json
     python -m gsfeatloc_ros.tools.benchmark scaling --out scaling.png
+    python -m gsfeatloc_ros.tools.benchmark index --out index.png
     python -m gsfeatloc_ros.tools.benchmark twins --share 0,0.02 --photos 200
     python -m gsfeatloc_ros.tools.benchmark pnp
 
@@ -22,6 +23,7 @@ from typing import Any
 
 import numpy as np
 
+from gsfeatloc_ros.benchmark import index_scaling
 from gsfeatloc_ros.benchmark.frames import measure_map, measure_scene, pinhole, print_frames, view_of_all
 from gsfeatloc_ros.benchmark.measure import machine
 from gsfeatloc_ros.benchmark.pnp import measure_pnp
@@ -116,6 +118,16 @@ def _parser() -> argparse.ArgumentParser:
     add_old_name(scaling, max_gaussians, "--most")
     scaling.set_defaults(run=_scaling)
 
+    index = commands.add_parser("index", parents=[file], help="seconds, size and query time against views, as a plot")
+    index.add_argument("--out", type=Path, required=True, metavar="FILE.png", help="the plot")
+    index.add_argument(
+        "--max-views",
+        type=int,
+        default=index_scaling.COUNTS[-1],
+        help="of the largest index; 50,000 take 4 GB (default: %(default)s)",
+    )
+    index.set_defaults(run=_index)
+
     twins = commands.add_parser("twins", parents=[file], help="photos of one of two rooms that are nearly alike")
     twins.add_argument(
         "--share",
@@ -193,6 +205,15 @@ def _scaling(options: argparse.Namespace) -> None:
         raise ValueError(f"--max-gaussians must be at least {COUNTS[0]}")
     rows = measure_scaling(counts)
     draw_scaling(rows, options.out)
+    _write(options.json, {"rows": rows})
+
+
+def _index(options: argparse.Namespace) -> None:
+    counts = [count for count in index_scaling.COUNTS if count <= options.max_views]
+    if not counts:
+        raise ValueError(f"--max-views must be at least {index_scaling.COUNTS[0]}")
+    rows = index_scaling.measure_index(counts)
+    index_scaling.draw_index(rows, options.out)
     _write(options.json, {"rows": rows})
 
 
