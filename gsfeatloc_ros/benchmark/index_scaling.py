@@ -67,15 +67,15 @@ def draw_index(rows: Sequence[dict[str, Any]], path: Path) -> None:
     def draw(number: int, own: Sequence[dict[str, Any]], figure_of: str, label: str) -> None:
         axes[number].plot([row["views"] for row in own], [row[figure_of] for row in own], "o-", label=label)
 
-    draw(0, room, "make_s", "made of a map: the simulated room")
-    draw(0, made_up, "make_s", "of these: features compressed")
-    draw(0, made_up, "load_s", "first query after loading")
+    draw(0, room, "make_s", "made of the room's map")
+    draw(0, made_up, "make_s", "compression")
+    draw(0, made_up, "load_s", "first query")
     draw(1, made_up, "size_mb", "file")
     draw(2, made_up, "query_ms", "all views ranked")
     for axis, label in zip(axes, ("CPU-seconds", "MB", "CPU-ms"), strict=True):
         axis.set(xlabel="views", ylabel=label, xscale="log", yscale="log")
         axis.grid(which="both", alpha=0.3)
-        axis.legend()
+        axis.legend(loc="lower right")
     words = f"made-up features, {_VIEW_FEATURES} a view; a photo of {_PHOTO_FEATURES}"
     figure.suptitle(f"{words}\n{machine()['cpu']}, {machine()['cores']} cores")
     figure.savefig(path, dpi=110)
