@@ -75,7 +75,7 @@ def draw_index(rows: Sequence[dict[str, Any]], path: Path) -> None:
     for axis, label in zip(axes, ("CPU-seconds", "MB", "CPU-ms"), strict=True):
         axis.set(xlabel="views", ylabel=label, xscale="log", yscale="log")
         axis.grid(which="both", alpha=0.3)
-        axis.legend(loc="lower right")
+        axis.legend(loc="lower right", fontsize="x-small")
     words = f"made-up features, {_VIEW_FEATURES} a view; a photo of {_PHOTO_FEATURES}"
     figure.suptitle(f"{words}\n{machine()['cpu']}, {machine()['cores']} cores")
     figure.savefig(path, dpi=110)
