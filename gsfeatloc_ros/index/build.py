@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 from gsfeatloc_ros.common.arrays import to_host
 from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.stage_clock import Interrupted
+from gsfeatloc_ros.index.look_alikes import find_look_alikes
 from gsfeatloc_ros.index.options import IndexOptions
 from gsfeatloc_ros.index.placement import cover, overlap, radius, random_poses, seen_cells, sees
 from gsfeatloc_ros.index.view_index import ViewIndex
@@ -97,11 +98,12 @@ def build_index(
     quality = np.minimum([view.confirmed.sum() / _ENOUGH_FEATURES for view in views], 1.0).astype(np.float32)
     kept = [views[view] for view in cover(worth[:, shortlist] * quality, options.views)]
     progress(total, total)
-    return ViewIndex.compress(
+    index = ViewIndex.compress(
         np.array([view.pose for view in kept]).reshape(-1, 4, 4),
         [view.descriptors[view.confirmed] for view in kept] or [np.empty((0, 1))],
         [view.points[view.confirmed] for view in kept] or [np.empty((0, 3))],
     )
+    return replace(index, look_alikes=find_look_alikes(index, _camera(*_VIEW)))
 
 
 @dataclass(eq=False)

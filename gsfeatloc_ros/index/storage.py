@@ -20,9 +20,9 @@ SUFFIX = ".gsfeatloc-index"
 
 # A file is this line, the SHA-256 of all that follows it, the length of the header (4 bytes, little-endian), the header
 # (JSON) and the arrays one after another. The line changes with the format.
-_MAGIC = b"gsfeatloc_ros view index 1\n"
+_MAGIC = b"gsfeatloc_ros view index 2\n"
 _MAX_HEADER_BYTES = 64 * 1024
-# Type and shape of the arrays; N views, M features, D / CODE_BYTES numbers for each byte of a code.
+# Type and shape of the arrays; N views, M features, D / CODE_BYTES numbers for each byte of a code, S look-alikes.
 _ARRAYS: dict[str, tuple[str, tuple[str | int, ...]]] = {
     "poses": ("<f8", ("N", 4, 4)),
     "counts": ("<i4", ("N",)),
@@ -31,8 +31,9 @@ _ARRAYS: dict[str, tuple[str, tuple[str | int, ...]]] = {
     "centroids": ("<f2", (CODE_BYTES, 256, "D")),
     "low": ("<f8", (3,)),
     "high": ("<f8", (3,)),
+    "look_alikes": ("<f8", ("S", 4, 4)),
 }
-_MAX_SIZES = {"N": 1_000_000, "M": 2**31 - 1, "D": 64}
+_SIZES = {"N": (1, 1_000_000), "M": (1, 2**31 - 1), "D": (1, 64), "S": (0, 1000)}
 
 
 def index_path(map_path: str | Path) -> Path:
@@ -61,7 +62,12 @@ def save_index(path: Path, index: ViewIndex, key: dict[str, Any]) -> None:
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     arrays = {name: np.ascontiguousarray(getattr(index, name), dtype) for name, (dtype, _) in _ARRAYS.items()}
-    sizes = {"N": len(index), "M": len(index.codes), "D": index.centroids.shape[2]}
+    sizes = {
+        "N": len(index),
+        "M": len(index.codes),
+        "D": index.centroids.shape[2],
+        "S": len(index.look_alikes),
+    }
     header = json.dumps({"key": key, "sizes": sizes}).encode()
     parts = [len(header).to_bytes(4, "little"), header, *(array.tobytes() for array in arrays.values())]
     digest = hashlib.sha256()
@@ -112,11 +118,11 @@ def _read(stream: BinaryIO, path: Path, key: dict[str, Any] | None) -> ViewIndex
     encoded = stream.read(length)
     try:
         header = json.loads(encoded)
-        sizes = {name: int(header["sizes"][name]) for name in _MAX_SIZES}
+        sizes = {name: int(header["sizes"][name]) for name in _SIZES}
         stored = header["key"]
     except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
         raise damaged from error
-    if not all(0 < sizes[name] <= most for name, most in _MAX_SIZES.items()):
+    if not all(least <= sizes[name] <= most for name, (least, most) in _SIZES.items()):
         raise damaged
     if key is not None and stored != key:
         return None
@@ -136,7 +142,9 @@ def _read(stream: BinaryIO, path: Path, key: dict[str, Any] | None) -> ViewIndex
     arrays["centroids"] = arrays["centroids"].astype(np.float32)
     index = ViewIndex(**arrays)
     counts = index.counts.astype(np.int64)
-    finite = all(np.isfinite(getattr(index, name)).all() for name in ("poses", "centroids", "low", "high"))
+    finite = all(
+        np.isfinite(getattr(index, name)).all() for name in ("poses", "centroids", "low", "high", "look_alikes")
+    )
     if digest.digest() != checksum or (counts < 0).any() or counts.sum() != sizes["M"] or not finite:
         raise damaged
     return index

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
 from typing import Any
@@ -38,6 +38,7 @@ class ViewIndex:
         codes: (M, CODE_BYTES) uint8, the features' descriptors, compressed.
         centroids: (CODE_BYTES, 256, D / CODE_BYTES) float32, what the bytes of a code stand for.
         low, high: (3,) float64, box of the points, map frame.
+        look_alikes: (S, 4, 4) float64, motions of the map frame that carry places to others which look alike.
     """
 
     poses: np.ndarray
@@ -47,6 +48,7 @@ class ViewIndex:
     centroids: np.ndarray
     low: np.ndarray
     high: np.ndarray
+    look_alikes: np.ndarray = field(default_factory=lambda: np.empty((0, 4, 4)))
 
     def __len__(self) -> int:
         return len(self.poses)
@@ -64,18 +66,31 @@ class ViewIndex:
         votes = np.unique(np.column_stack([np.repeat(np.arange(len(views)), views.shape[1]), views.ravel()]), axis=0)
         return np.bincount(votes[:, 1], minlength=len(self) + 1)[: len(self)].astype(np.float64)
 
+    def nearest(self, features: Features, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """Find what is nearest to features of a photo in all views; `count` of each, or as many as there are.
+
+        Returns:
+            Squared distances (n, count) float32 of the descriptors, the nearest first, infinite where there are no more
+            near enough to be looked at; and the points (n, count, 3) of the map.
+        """
+        distances, numbers = self._search.search(features.descriptors, min(count, len(self.codes)))
+        return np.where(numbers >= 0, distances, np.inf), self._points(numbers)
+
     def match(self, features: Features, view: int) -> tuple[Matches, np.ndarray]:
         """Match a photo's features with a view's; return the matches, and the points (M, 3) of the map at them.
 
         `b` of the matches is of no meaning: where in the view its features lie is not kept.
         """
-        kept = slice(self._first[view], self._first[view + 1])
-        numbers = np.arange(kept.stop - kept.start, dtype=np.float32)
-        descriptors = self._decoded(self.codes[kept])
+        descriptors, points = self.contents(view)
+        numbers = np.arange(len(points), dtype=np.float32)
         there = Features(np.column_stack([numbers, numbers]), descriptors, np.ones(len(numbers), np.float32))
         matches = match_mutual(features, there, max_ratio=_MAX_DISTANCE_RATIO)
-        points = self.points[kept][matches.b[:, 0].astype(int)]
-        return matches, self.low + points / _STEPS * (self.high - self.low)
+        return matches, points[matches.b[:, 0].astype(int)]
+
+    def contents(self, view: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the descriptors (m, D) float32 of a view's features, and the points (m, 3) of the map under them."""
+        kept = slice(self._first[view], self._first[view + 1])
+        return self._decoded(self.codes[kept]), self._points(kept)
 
     @cached_property
     def centres(self) -> np.ndarray:
@@ -133,6 +148,10 @@ class ViewIndex:
     @cached_property
     def _view_of(self) -> np.ndarray:
         return np.repeat(np.arange(len(self)), self.counts)
+
+    def _points(self, numbers: slice | np.ndarray) -> np.ndarray:
+        """Return the points (..., 3), map frame, of features by their numbers."""
+        return self.low + self.points[numbers] / _STEPS * (self.high - self.low)
 
     def _decoded(self, codes: np.ndarray) -> np.ndarray:
         """Return the descriptors (m, D) float32 of codes (m, CODE_BYTES), of unit length."""

@@ -11,10 +11,12 @@ import numpy as np
 
 from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.geometry import invert, make_pose, so3_exp, transform
+from gsfeatloc_ros.index.look_alikes import poses_elsewhere
 from gsfeatloc_ros.localize.evidence import Evidence
 from gsfeatloc_ros.localize.prior import Prior
 from gsfeatloc_ros.localize.query import MatchedView, Query
 from gsfeatloc_ros.localize.retrieval import Hint, retrieve
+from gsfeatloc_ros.match.base import Features
 
 # Matches that agree on a pose, by which a view suggests it. Chance makes some agree too: the map is looked at from the
 # pose of a hint that is not strong, and has to confirm it.
@@ -31,9 +33,6 @@ _BATCH = 8
 _MIN_INDEX_HINT = 6
 # Of what the index suggested, so many are followed once all its views were compared.
 _MAX_FOLLOWED_HINTS = 12
-# Another pose is looked at if so many times as many matches agree with it, in views of so many times as many votes.
-_RIVAL_SHARE = 0.5
-_MAX_RIVALS = 3
 # Poses from which the same points are seen at least so many pixels apart are different places.
 _MIN_DISTANCE_OF_RIVALS = 40.0
 # Of the views that are looked at together, the best of this many are followed.
@@ -62,9 +61,7 @@ class Search:
         self._small, self._prior, self._now = small, prior, now
         self.best: MatchedView | None = None
         self.views = self.searched = 0
-        self._hints: Iterator[Hint | None] = iter(())
         self._pending: list[tuple[float, int, Hint]] = []
-        self._followed: Hint | None = None
 
     def poses(self) -> Iterator[np.ndarray]:
         """Yield poses (4, 4) of the photo, as long as one is asked for and views are left."""
@@ -98,21 +95,23 @@ class Search:
         return 0 if index is None else len(index)
 
     def rivals(self, found: MatchedView) -> Iterator[np.ndarray]:
-        """Yield poses (4, 4), far from the one `found`, which the index suggested nearly as strongly."""
-        if self._followed is None or found.solution is None:
+        """Yield poses (4, 4), far from the one `found` by the index, that explain the photo by it as well."""
+        index, features, camera = self._small.components.index, self._small.features, self._small.photo.camera
+        # A pose that was found at the prior stands by the prior.
+        if index is None or found.solution is None or self.searched == 0 or not isinstance(features, Features):
             return
-        least = _RIVAL_SHARE * self._followed.inliers
-        self._compare(islice(self._hints, max(2 * _BATCH - self.searched, 0)))
         places = [found.solution.T_map_camera]
-        points, camera = found.found.points[found.solution.inliers], self._small.photo.camera
-        for _, _, hint in sorted(self._pending):
-            if len(places) > _MAX_RIVALS or hint.inliers < max(least, _MIN_INDEX_HINT):
-                continue
-            if any(_offset(camera, points, hint.pose, place) < _MIN_DISTANCE_OF_RIVALS for place in places):
-                continue
-            places.append(hint.pose)
-            pose = self._confirmed(hint.pose)
-            if pose is not None and _offset(camera, points, pose, places[0]) >= _MIN_DISTANCE_OF_RIVALS:
+        seen = transform(invert(places[0]), found.found.points[found.solution.inliers])
+        with self._small.clock.stage("search"):
+            elsewhere = list(poses_elsewhere(index, camera, features.on_host(), places[0]))
+
+        def is_known(pose: np.ndarray) -> bool:
+            return any(_offset(camera, seen, pose, place) < _MIN_DISTANCE_OF_RIVALS for place in places)
+
+        for hint in (*(motion @ places[0] for motion in index.look_alikes), *elsewhere):
+            pose = None if is_known(hint) else self._confirmed(hint)
+            if pose is not None and not is_known(pose):
+                places.append(pose)
                 yield pose
 
     def _spread(self, prior: Prior) -> list[np.ndarray]:
@@ -141,8 +140,8 @@ class Search:
         def likely(pose: np.ndarray) -> bool:
             return prior is None or prior.deviation(pose) <= _MAX_DEVIATION
 
-        self._hints = islice(retrieve(self._small, components.index, likely), options.max_views)
-        while self._compare(islice(self._hints, _BATCH)) and self._now() < end:
+        hints = islice(retrieve(self._small, components.index, likely), options.max_views)
+        while self._compare(islice(hints, _BATCH)) and self._now() < end:
             yield from self._follow(_MAX_FOLLOWED_VIEWS, MIN_HINT)
         yield from self._follow(_MAX_FOLLOWED_HINTS, _MIN_INDEX_HINT)
 
@@ -160,8 +159,8 @@ class Search:
         for _ in range(min(count, len(self._pending))):
             if self._pending[0][2].inliers < min_inliers:
                 return
-            _, _, self._followed = heapq.heappop(self._pending)
-            pose = self._confirmed(self._followed.pose)
+            _, _, hint = heapq.heappop(self._pending)
+            pose = self._confirmed(hint.pose)
             if pose is not None:
                 yield pose
 
@@ -177,13 +176,16 @@ class Search:
             self.best = view
 
 
-def _offset(camera: Camera, points: np.ndarray, a: np.ndarray, b: np.ndarray) -> float:
-    """Return how far apart, in pixels in the median, points (N, 3) are seen from two poses (4, 4)."""
-    here, there = (transform(invert(pose), points) for pose in (a, b))
-    ahead = (here[:, 2] > 0) & (there[:, 2] > 0)
-    if ahead.sum() < 0.5 * len(points):
+def _offset(camera: Camera, seen: np.ndarray, a: np.ndarray, b: np.ndarray) -> float:
+    """Return how far apart two poses (4, 4) are, in pixels in the median, by points (N, 3) in the camera frame of `b`.
+
+    It is infinite where most of them are behind `a`.
+    """
+    there = transform(invert(a) @ b, seen)
+    ahead = there[:, 2] > 0
+    if ahead.sum() < 0.5 * len(seen):
         return float("inf")
-    return float(np.median(np.linalg.norm(camera.project(here[ahead]) - camera.project(there[ahead]), axis=1)))
+    return float(np.median(np.linalg.norm(camera.project(there[ahead]) - camera.project(seen[ahead]), axis=1)))
 
 
 def look(query: Query, poses: Sequence[np.ndarray]) -> list[MatchedView]:

@@ -29,9 +29,6 @@ from gsfeatloc_ros.ros_io.outcome import Outcome
 from gsfeatloc_ros.ros_io.prior import Prior
 from gsfeatloc_ros.ros_io.state import Decision, State
 
-# Standard deviations: an answer may be as far from the prior as it likes.
-_ANY_DEVIATION = 1e6
-
 
 @dataclass(frozen=True, eq=False)
 class Job:
@@ -199,14 +196,11 @@ class Attempts:
     def _options(self, options: LocalizerOptions, job: Job, query: LocalizerInput) -> LocalizerOptions:
         """Return the options for a job.
 
-        What was searched in vain is searched otherwise, with another seed. The robot may have been carried off by then:
-        its last answer says where to look first, and no more.
+        What was searched in vain is searched otherwise, with another seed.
         """
         failures = self._follower.state.failures
         if failures:
             options = replace(options, seed=(options.seed + failures) % (MAX_SEED + 1))
-        if failures and query.source is not None and query.source.own:
-            options = replace(options, limits=replace(options.limits, max_deviation=_ANY_DEVIATION))
         if job.max_seconds > 0:
             options = replace(options, search=replace(options.search, max_seconds=job.max_seconds))
         return options

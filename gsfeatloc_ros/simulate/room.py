@@ -6,6 +6,7 @@ Nothing here is shared with the Gaussian renderers.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
 
 import cv2
@@ -16,7 +17,7 @@ from gsfeatloc_ros.simulate.solids import Box, Solid, Sphere, rotate
 from gsfeatloc_ros.simulate.texture import paint
 
 # Width of a texel in metres: at most a pixel of the photos, wherever a camera stands.
-_TEXEL = 0.005
+TEXEL = 0.005
 # Direction to the lamp that shades the solids, from the map frame.
 _LIGHT = np.array([0.4, -0.5, 0.77])
 
@@ -62,21 +63,35 @@ class Room:
     Attributes:
         solids: the walls, seen from inside, and then the furniture.
         pictures: those (rows, cols, 3) uint8 RGB on the six faces of each solid; rows run along v, columns along u.
+            What is painted on them is seen.
     """
 
     def __init__(self, seed: int = 0) -> None:
         rng = np.random.default_rng(seed)
         self.solids: tuple[Solid, ...] = (_SHELL, *_FURNITURE)
-        self.pictures = [[_paint_face(rng, solid, face) for face in range(6)] for solid in self.solids]
+        painted = [[_paint_face(rng, solid, face) for face in range(6)] for solid in self.solids]
         # All pictures under one another, so that one look-up serves all rays whatever they hit.
-        shapes = np.array([[picture.shape[:2] for picture in faces] for faces in self.pictures])
+        shapes = np.array([[picture.shape[:2] for picture in faces] for faces in painted])
         rows = shapes[:, :, 0].ravel()
         tops = np.cumsum(rows) - rows
         self._atlas = np.zeros((rows.sum(), shapes[:, :, 1].max(), 3), np.uint8)
-        for top, picture in zip(tops, (picture for faces in self.pictures for picture in faces), strict=True):
-            self._atlas[top : top + picture.shape[0], : picture.shape[1]] = picture
+        self._places = [
+            [np.s_[top : top + rows, :cols] for top, (rows, cols) in zip(*faces, strict=True)]
+            for faces in zip(tops.reshape(shapes.shape[:2]), shapes, strict=True)
+        ]
+        self.pictures = self._pictures()
+        for faces, there in zip(painted, self.pictures, strict=True):
+            for picture, place in zip(faces, there, strict=True):
+                place[:] = picture
         self._tops = tops.reshape(shapes.shape[:2]).astype(np.float32)
         self._extents = shapes[:, :, ::-1].astype(np.float32)
+
+    def copy(self) -> Room:
+        """Return a room that looks the same, whose pictures are its own to paint on."""
+        other = copy(self)
+        other._atlas = self._atlas.copy()
+        other.pictures = other._pictures()
+        return other
 
     def is_free(self, points: np.ndarray, margin: float = 0.0) -> np.ndarray:
         """Return whether points (N, 3) are inside the walls and outside all solids by `margin` metres: (N,) bool."""
@@ -119,6 +134,10 @@ class Room:
         colours = cv2.remap(self._atlas, texels, None, cv2.INTER_LINEAR)  # type: ignore[call-overload]
         return colours.astype(np.float32) / 255, depth.reshape(height, width)
 
+    def _pictures(self) -> list[list[np.ndarray]]:
+        """Return the pictures of the faces as they are in the atlas."""
+        return [[self._atlas[place] for place in faces] for faces in self._places]
+
     def _texels(self, points: np.ndarray, hit: np.ndarray) -> np.ndarray:
         """Return where in the atlas (N, 2) the surface points (N, 3) of the solids `hit` (N,) are."""
         texels = np.empty((len(points), 2), np.float32)
@@ -152,8 +171,8 @@ def _may_meet(solids: Sequence[Solid], origin: np.ndarray, directions: np.ndarra
 
 def _paint_face(rng: np.random.Generator, solid: Solid, face: int) -> np.ndarray:
     """Paint the picture of a face: rows run along v, columns along u."""
-    cols, rows = np.maximum(np.rint(solid.face_size(face) / _TEXEL), 1).astype(int)
-    picture = paint(rng, rows, cols, _TEXEL)
+    cols, rows = np.maximum(np.rint(solid.face_size(face) / TEXEL), 1).astype(int)
+    picture = paint(rng, rows, cols, TEXEL)
     _, normals = solid.face_points(face, grid_uv(rows, cols))
     shade = 0.8 + 0.2 * (normals @ _LIGHT)
     return (picture * shade.reshape(rows, cols, 1)).astype(np.uint8)

@@ -6,6 +6,8 @@
     python -m gsfeatloc_ros.tools.benchmark opensplat --map map.ply --checkout OpenSplat
     python -m gsfeatloc_ros.tools.benchmark query --scene SCENE --matcher xfeat --json query.json
     python -m gsfeatloc_ros.tools.benchmark scaling --out scaling.png
+    python -m gsfeatloc_ros.tools.benchmark index --out index.png
+    python -m gsfeatloc_ros.tools.benchmark twins --share 0,0.02 --photos 200
     python -m gsfeatloc_ros.tools.benchmark pnp
 
 CPU milliseconds count all threads; on a shared machine they, and ratios within one run, mean more than wall time.
@@ -21,11 +23,13 @@ from typing import Any
 
 import numpy as np
 
+from gsfeatloc_ros.benchmark import index_scaling
 from gsfeatloc_ros.benchmark.frames import measure_map, measure_scene, pinhole, print_frames, view_of_all
 from gsfeatloc_ros.benchmark.measure import machine
 from gsfeatloc_ros.benchmark.pnp import measure_pnp
 from gsfeatloc_ros.benchmark.query import measure_queries, print_queries
 from gsfeatloc_ros.benchmark.scaling import COUNTS, draw_scaling, measure_scaling
+from gsfeatloc_ros.benchmark.twins import measure_twins, twins_table
 from gsfeatloc_ros.common.geometry import make_pose, matrix_from_quaternion, quaternion_from_matrix
 from gsfeatloc_ros.evaluate.scene import load_scene
 from gsfeatloc_ros.localize.settings import RendererSettings
@@ -34,7 +38,7 @@ from gsfeatloc_ros.maps.ply import write_ply
 from gsfeatloc_ros.match import DEFAULT_MATCHER, MATCHERS
 from gsfeatloc_ros.render import DEVICES
 from gsfeatloc_ros.simulate.two_rooms import VIEWS, two_rooms
-from gsfeatloc_ros.tools.options import add_old_name
+from gsfeatloc_ros.tools.options import add_old_name, number
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -114,6 +118,28 @@ def _parser() -> argparse.ArgumentParser:
     add_old_name(scaling, max_gaussians, "--most")
     scaling.set_defaults(run=_scaling)
 
+    index = commands.add_parser("index", parents=[file], help="seconds, size and query time against views, as a plot")
+    index.add_argument("--out", type=Path, required=True, metavar="FILE.png", help="the plot")
+    index.add_argument(
+        "--max-views",
+        type=int,
+        default=index_scaling.COUNTS[-1],
+        help="of the largest index; 50,000 take 4 GB (default: %(default)s)",
+    )
+    index.set_defaults(run=_index)
+
+    twins = commands.add_parser("twins", parents=[file], help="photos of one of two rooms that are nearly alike")
+    twins.add_argument(
+        "--share",
+        type=_shares,
+        default=[0.0, 0.02],
+        metavar="LIST",
+        help="of the second room's surfaces that other pictures cover, each in a map of its own (default: 0,0.02)",
+    )
+    twins.add_argument("--photos", type=int, default=200, help="in each map (default: %(default)s)")
+    twins.add_argument("--seed", type=int, default=0, help="another one gives other rooms, photos and indices")
+    twins.set_defaults(run=_twins)
+
     commands.add_parser("pnp", help="PoseLib against OpenCV's USAC on simulated matches").set_defaults(
         run=lambda options: measure_pnp()
     )
@@ -182,6 +208,23 @@ def _scaling(options: argparse.Namespace) -> None:
     _write(options.json, {"rows": rows})
 
 
+def _index(options: argparse.Namespace) -> None:
+    counts = [count for count in index_scaling.COUNTS if count <= options.max_views]
+    if not counts:
+        raise ValueError(f"--max-views must be at least {index_scaling.COUNTS[0]}")
+    rows = index_scaling.measure_index(counts)
+    index_scaling.draw_index(rows, options.out)
+    _write(options.json, {"rows": rows})
+
+
+def _twins(options: argparse.Namespace) -> None:
+    if options.photos < 1:
+        raise ValueError("--photos must be at least 1")
+    rows = measure_twins(options.share, options.photos, options.seed)
+    print(twins_table(rows))
+    _write(options.json, {"rows": rows})
+
+
 def _write(path: Path | None, report: dict[str, Any]) -> None:
     if path:
         path.write_text(json.dumps({"machine": machine()} | report, indent=1) + "\n")
@@ -189,6 +232,13 @@ def _write(path: Path | None, report: dict[str, Any]) -> None:
 
 def _pose(numbers: list[float]) -> np.ndarray:
     return make_pose(matrix_from_quaternion(np.array(numbers[3:])), np.array(numbers[:3]))
+
+
+def _shares(text: str) -> list[float]:
+    shares = [number(float, 0.0)(part) for part in text.split(",")]
+    if max(shares) > 1:
+        raise argparse.ArgumentTypeError(f"{text} is not a list of numbers from 0 to 1")
+    return shares
 
 
 def _size(text: str) -> tuple[int, int]:

@@ -14,9 +14,11 @@ import pytest
 from room_datasets import write_nerfstudio
 
 from gsfeatloc_ros.benchmark.frames import pinhole, view_of_all
+from gsfeatloc_ros.benchmark.index_scaling import draw_index, measure_index
 from gsfeatloc_ros.benchmark.measure import memory_taken, spread, timed
 from gsfeatloc_ros.benchmark.opensplat import measure_against_opensplat
 from gsfeatloc_ros.benchmark.scaling import draw_scaling, measure_scaling
+from gsfeatloc_ros.benchmark.twins import twins_table
 from gsfeatloc_ros.common.geometry import invert, quaternion_from_matrix, transform
 from gsfeatloc_ros.maps import load_map
 from gsfeatloc_ros.render import create_renderer
@@ -161,6 +163,26 @@ def test_scaling_measures_every_value_and_draws_it(tmp_path):
     assert cv2.imread(str(path)).std() > 10
 
 
+@pytest.mark.slow
+def test_index_measures_every_count_and_draws_it(tmp_path):
+    rows = measure_index([20, 40])
+    made_up = [row for row in rows if "query_ms" in row]
+    assert [row["views"] for row in made_up] == [20, 40]
+    assert made_up[1]["size_mb"] > made_up[0]["size_mb"]
+    path = tmp_path / "index.png"
+    draw_index(rows, path)
+    assert cv2.imread(str(path)).std() > 10
+
+
+def test_outcomes_of_twins_are_counted_by_what_differs():
+    rows = [{"different": different, "outcome": "right"} for different in (0.0, 0.001, 0.012, 0.013)]
+    rows.append({"different": 0.013, "outcome": "ambiguous"})
+    _, *lines = twins_table(rows).splitlines()
+    assert lines[0].split() == ["none", "1", "1", "0", "0", "0"]
+    assert [int(line.split()[-5]) for line in lines] == [1, 1, 0, 0, 3, 0]
+    assert lines[4].split()[-4:] == ["2", "1", "0", "0"]
+
+
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
@@ -176,6 +198,8 @@ def test_scaling_measures_every_value_and_draws_it(tmp_path):
         (["synthetic", "--gaussians", "0", "--out", "MAP"], "--gaussians"),
         (["synthetic", "--gaussians", "1", "--out", "/nowhere/map.ply"], "/nowhere/map.ply"),
         (["scaling", "--max-gaussians", "0", "--out", "plot.png"], "--max-gaussians"),
+        (["index", "--max-views", "99", "--out", "plot.png"], "--max-views"),
+        (["twins", "--photos", "0"], "--photos"),
     ],
 )
 def test_what_cannot_be_measured_is_said_in_one_line(map_file, capsys, arguments, says):
