@@ -121,7 +121,7 @@ def test_images_that_are_refused_for_the_focal_length_count():
 
 def test_images_that_are_refused_for_other_reasons_do_not_count():
     health = CameraHealth()
-    for evidence in (replace(GOOD, focal_error=0.005, probability_wrong=0.3), replace(GOOD, deviation=100.0)):
+    for evidence in (replace(GOOD, focal_error=0.005, probability_wrong=0.3), replace(GOOD, coverage=0.0)):
         assert verdict(evidence, Limits())
         health.take(CAMERA, Estimate(Status.REJECTED, "", evidence=evidence))
     assert health.focal_length.count == 0

@@ -151,7 +151,7 @@ def test_parameters_are_those_of_the_node(document: Path) -> None:
     groups = {group: set(names) for group, names in tree.items() if isinstance(names, dict)}
     for code in code_of(document):
         for group, name in re.findall(rf"(?<![\w./-])({'|'.join(groups)})\.(\w+)(?=:=|$|`)", code):
-            if name not in ("ply", "md", "yaml", "csv"):
+            if name not in ("ply", "md", "yaml", "csv", "png"):
                 assert name in groups[group], f"{group}.{name}"
 
 
