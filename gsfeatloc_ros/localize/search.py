@@ -95,20 +95,24 @@ class Search:
         return 0 if index is None else len(index)
 
     def rivals(self, found: MatchedView) -> Iterator[np.ndarray]:
-        """Yield poses (4, 4), far from the one `found` by the index, that explain the photo by it as well."""
+        """Yield poses (4, 4), far from the one `found`, that explain the photo as well by the index and the prior."""
         index, features, camera = self._small.components.index, self._small.features, self._small.photo.camera
-        # A pose that was found at the prior stands by the prior.
-        if index is None or found.solution is None or self.searched == 0 or not isinstance(features, Features):
+        if index is None or found.solution is None or not isinstance(features, Features):
             return
         places = [found.solution.T_map_camera]
         seen = transform(invert(places[0]), found.found.points[found.solution.inliers])
-        with self._small.clock.stage("search"):
-            elsewhere = list(poses_elsewhere(index, camera, features.on_host(), places[0]))
+        elsewhere = [motion @ places[0] for motion in index.look_alikes]
+        if self.searched == 0:
+            # It was found at the prior, and stands by it, unless the prior holds others for possible too.
+            elsewhere = [pose for pose in elsewhere if self._likely(pose)]
+        else:
+            with self._small.clock.stage("search"):
+                elsewhere += poses_elsewhere(index, camera, features.on_host(), places[0])
 
         def is_known(pose: np.ndarray) -> bool:
             return any(_offset(camera, seen, pose, place) < _MIN_DISTANCE_OF_RIVALS for place in places)
 
-        for hint in (*(motion @ places[0] for motion in index.look_alikes), *elsewhere):
+        for hint in elsewhere:
             pose = None if is_known(hint) else self._confirmed(hint)
             if pose is not None and not is_known(pose):
                 places.append(pose)
@@ -132,18 +136,17 @@ class Search:
 
     def _indexed(self) -> Iterator[np.ndarray]:
         """Compare the photo with the index's views and yield the poses that the best of them suggest."""
-        components, prior = self._small.components, self._prior
-        options = components.options.search
-        assert components.index is not None
+        index, options = self._small.components.index, self._small.components.options.search
+        assert index is not None
         end = self._now() + options.max_seconds
-
-        def likely(pose: np.ndarray) -> bool:
-            return prior is None or prior.deviation(pose) <= _MAX_DEVIATION
-
-        hints = islice(retrieve(self._small, components.index, likely), options.max_views)
+        hints = islice(retrieve(self._small, index, self._likely), options.max_views)
         while self._compare(islice(hints, _BATCH)) and self._now() < end:
             yield from self._follow(_MAX_FOLLOWED_VIEWS, MIN_HINT)
         yield from self._follow(_MAX_FOLLOWED_HINTS, _MIN_INDEX_HINT)
+
+    def _likely(self, pose: np.ndarray) -> bool:
+        """Return whether the prior holds a pose (4, 4) for possible."""
+        return self._prior is None or self._prior.deviation(pose) <= _MAX_DEVIATION
 
     def _compare(self, hints: Iterator[Hint | None]) -> bool:
         """Take in what views of the index suggest; return whether there were any."""

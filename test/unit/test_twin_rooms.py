@@ -83,6 +83,14 @@ def test_a_prior_decides_between_identical_rooms(in_identical, photos) -> None:
             assert are_near(estimate.T_map_camera, pose)
 
 
+def test_a_prior_that_may_be_of_either_room_does_not_decide(in_identical, photos) -> None:
+    for photo in photos:
+        wide = np.diag([10.0**2] * 3 + [0.3**2] * 3)
+        estimate = in_identical.localize(photo.image, CAMERA, photo.poses[1], wide)
+        assert estimate.status is Status.AMBIGUOUS, estimate.reason
+        assert len(estimate.candidates) == 2
+
+
 @pytest.mark.slow
 def test_the_right_room_is_found_by_a_hundredth_of_what_is_seen(room, matcher) -> None:
     world = TwinRooms(room, share=0.02)
