@@ -33,6 +33,8 @@ _BATCH = 8
 _MIN_INDEX_HINT = 6
 # Of what the index suggested, so many are followed once all its views were compared.
 _MAX_FOLLOWED_HINTS = 12
+# Most views around a prior that are rendered once the index has found nothing.
+_VIEWS_AFTER_INDEX = 8
 # Poses from which the same points are seen at least so many pixels apart are different places.
 _MIN_DISTANCE_OF_RIVALS = 40.0
 # Of the views that are looked at together, the best of this many are followed.
@@ -69,7 +71,7 @@ class Search:
             yield from self._look([self._prior.pose])
         if self._small.components.index is not None:
             yield from self._indexed()
-        elif self._prior is not None:
+        if self._prior is not None:
             poses = self._spread(self._prior)
             for start in range(0, len(poses), _BATCH):
                 yield from self._look(poses[start : start + _BATCH])
@@ -121,7 +123,9 @@ class Search:
     def _spread(self, prior: Prior) -> list[np.ndarray]:
         options = self._small.components.options
         min_step = _MIN_VIEW_STEP * np.sqrt(options.prior_covariance().diagonal())
-        return spread_poses(prior.pose, prior.covariance, min_step, options.max_views, options.seed)
+        has_index = self._small.components.index is not None
+        count = min(options.max_views, _VIEWS_AFTER_INDEX) if has_index else options.max_views
+        return spread_poses(prior.pose, prior.covariance, min_step, count, options.seed)
 
     def _look(self, poses: Sequence[np.ndarray]) -> Iterator[np.ndarray]:
         """Render views and yield the poses that the best of them suggest."""

@@ -12,8 +12,11 @@ from gsfeatloc_ros.common.geometry import make_pose, so3_exp
 
 
 @pytest.fixture(scope="module")
-def localizer(room_map_file):
-    with running_localizer(map__path=room_map_file, image__transport="compressed", image__rectified=True) as process:
+def localizer(room_map_file, tmp_path_factory):
+    """Without an index: what a prior does not show is searched round it."""
+    index = {"index__build": False, "index__path": tmp_path_factory.mktemp("none") / "index"}
+    images = {"image__transport": "compressed", "image__rectified": True}
+    with running_localizer(map__path=room_map_file, **images, **index) as process:
         yield process
 
 
