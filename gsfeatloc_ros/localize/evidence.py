@@ -21,7 +21,7 @@ _MIN_VARIANCE_SHARE = 0.01
 _MAX_FOCAL_ERROR = 0.01
 _FOCAL_SIGMAS = 2.0
 # Of a pose that no prior expects so many times the risk is taken: a mirror image, or a wall seen from behind, is one.
-_UNEXPECTED = 0.001
+_UNEXPECTED = 1e-5
 # The weights of what tells right from wrong answers (docs/trust.md), and what their sum is shifted and scaled by to be
 # the logarithm of the odds that the answer is wrong. Ratios count by their logit, correlations by Fisher's z.
 _WEIGHTS = {"inlier_ratio": -1.11, "render_inlier_ratio": -1.61, "correlation": -5.03, "low_correlation": -2.22}
@@ -120,7 +120,7 @@ class Limits:
     # know.
     max_deviation: float = parameter(
         8.0,
-        "Farther than this many standard deviations from the prior, or without one, a thousandth of max_risk is taken.",
+        "Farther than this many standard deviations from the prior, or without one, 1e-5 of max_risk is taken.",
         (0.1, 1e6),
         live=True,
     )
