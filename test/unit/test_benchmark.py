@@ -164,6 +164,7 @@ def test_scaling_measures_every_value_and_draws_it(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 def test_index_measures_every_count_and_draws_it(tmp_path):
     rows = measure_index([20, 40])
     made_up = [row for row in rows if "query_ms" in row]

@@ -92,6 +92,7 @@ def test_a_prior_that_may_be_of_either_room_does_not_decide(in_identical, photos
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 def test_the_right_room_is_found_by_a_hundredth_of_what_is_seen(room, matcher) -> None:
     world = TwinRooms(room, share=0.02)
     renderer = create_renderer(world.cover())
