@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import signal
-import time
-
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -26,8 +23,6 @@ from gsfeatloc_ros.simulate import SimulatedPhoto
 
 # Seconds in which a robot that was carried off is found again.
 RECOVERY = 2.0
-# And in which the node leaves while it builds its index, on a slow machine.
-LEAVING = 5.0
 COVERED = np.random.default_rng(0).integers(0, 60, (480, 640, 3), dtype=np.uint8)
 
 
@@ -232,24 +227,3 @@ def test_a_prior_that_claims_to_be_better_than_it_is(client, photo):
 def test_a_prior_far_from_the_truth(client, photo, far):
     client.send_prior(pose_stamped(far.T_map_camera))
     Robot(client, False).find(photo, 1)
-
-
-def test_the_index_does_not_hold_up_the_node(room_map_file, room_camera, photo, tmp_path):
-    """It is ready before its index is, answers meanwhile by priors, and leaves at once."""
-    parameters = {"map__path": room_map_file, "index__path": tmp_path / "room.index", "index__views": 5000}
-    with running_localizer(**parameters) as process, connected_client() as client:
-        process.wait_for_output(r"building the view index: \d+ of \d+ views", TIMEOUT)
-        client.send_camera_info(camera_info_of(room_camera))
-        without = client.attempt(rgb_image(photo.image))
-        assert without.values["status"] == "failed"
-        assert "index" in without.reason
-        client.send_prior(pose_stamped(photo.T_map_camera_prior))
-        assert client.attempt(rgb_image(photo.image)).ok
-        assert client.spin_until(lambda: any("building" in said.reason for said in client.index))
-        began = time.monotonic()
-        process.signal(signal.SIGTERM)
-        assert process.wait() == 0
-        assert time.monotonic() - began < LEAVING
-        assert "Traceback" not in process.output
-        assert "did not end in time" not in process.output
-    assert list(tmp_path.iterdir()) == []
