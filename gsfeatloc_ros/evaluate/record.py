@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import gsfeatloc_ros
+from gsfeatloc_ros.common.replaced_file import replaced_file
 from gsfeatloc_ros.evaluate.dataset import Scene
 from gsfeatloc_ros.evaluate.metrics import QueryResult
 from gsfeatloc_ros.evaluate.protocol import PhotoPrior
@@ -116,9 +116,8 @@ class Record:
         for identity, fingerprint in self._fingerprints.items():
             lines.append(_header(identity, fingerprint))
             lines += [_line(identity, result) for result in self._results.get(identity, {}).values()]
-        temporary = self.path.with_name(self.path.name + ".new")
-        temporary.write_text("".join(lines), encoding="utf-8")
-        os.replace(temporary, self.path)
+        with replaced_file(self.path) as file:
+            file.write("".join(lines).encode())
 
 
 @dataclass(frozen=True)

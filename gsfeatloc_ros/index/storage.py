@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import json
 import math
 import os
-import tempfile
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 
 from gsfeatloc_ros.common.kernel_cache import can_write, user_cache_folder
+from gsfeatloc_ros.common.replaced_file import replaced_file
 from gsfeatloc_ros.index.view_index import CODE_BYTES, ViewIndex
 
 SUFFIX = ".gsfeatloc-index"
@@ -73,17 +72,8 @@ def save_index(path: Path, index: ViewIndex, key: dict[str, Any]) -> None:
     digest = hashlib.sha256()
     for part in parts:
         digest.update(part)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f"{path.name}.")
-    try:
-        with os.fdopen(handle, "wb") as stream:
-            stream.writelines([_MAGIC, digest.digest(), *parts])
-            stream.flush()
-            os.fsync(stream.fileno())
-        os.replace(temporary, path)
-    except OSError:
-        with contextlib.suppress(OSError):
-            os.unlink(temporary)
-        raise
+    with replaced_file(path) as stream:
+        stream.writelines([_MAGIC, digest.digest(), *parts])
 
 
 def load_index(path: Path, key: dict[str, Any] | None = None) -> ViewIndex | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import hashlib
 import json
@@ -17,6 +16,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from gsfeatloc_ros.common.kernel_cache import hash_of_sources
+from gsfeatloc_ros.common.replaced_file import replaced_file
 from gsfeatloc_ros.maps import MapError, Similarity, load_map
 from gsfeatloc_ros.render.prepare import PreparedMap, prepare
 
@@ -104,18 +104,12 @@ def _read(stream: BinaryIO, origin: dict[str, Any]) -> PreparedMap | None:
 
 
 def _write_if_possible(path: Path, prepared: PreparedMap, origin: dict[str, Any]) -> None:
-    """Write a cache in one step: whoever reads it finds the old one or the whole new one, after a power cut as well."""
-    temporary = path.with_name(f"{path.name}.{os.getpid()}")
+    """Write a cache; that it cannot be written is no error."""
     try:
-        with temporary.open("wb") as stream:
+        with replaced_file(path) as stream:
             _write(stream, prepared, origin)
-            stream.flush()
-            os.fsync(stream.fileno())
-        os.replace(temporary, path)
     except OSError as error:
         _log.debug("%s: cannot be written: %s", path, error.strerror)
-        with contextlib.suppress(OSError):
-            temporary.unlink()
 
 
 def _write(stream: BinaryIO, prepared: PreparedMap, origin: dict[str, Any]) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from gsfeatloc_ros.common.geometry import make_pose, matrix_from_quaternion, quaternion_from_matrix
+from gsfeatloc_ros.common.replaced_file import replaced_file
 
 _VERSION = 1
 # Of the file: nothing that is larger was written here.
@@ -34,16 +34,8 @@ def save_pose(path: Path, T_map_camera: np.ndarray, map_: Mapping[str, Any]) -> 
         "position": T_map_camera[:3, 3].tolist(),
         "orientation": quaternion_from_matrix(T_map_camera[:3, :3]).tolist(),
     }
-    # Beside it: a file is only renamed within a file system.
-    unfinished = path.with_name(f"{path.name}.{os.getpid()}.tmp")
-    try:
-        with unfinished.open("w") as file:
-            json.dump(saved, file, indent=1)
-            file.flush()
-            os.fsync(file.fileno())
-        unfinished.replace(path)
-    finally:
-        unfinished.unlink(missing_ok=True)
+    with replaced_file(path) as file:
+        file.write(json.dumps(saved, indent=1).encode())
 
 
 def load_pose(path: Path, map_: Mapping[str, Any]) -> np.ndarray:
