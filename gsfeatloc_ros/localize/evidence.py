@@ -6,14 +6,10 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from gsfeatloc_ros.common.geometry import so3_log
 from gsfeatloc_ros.common.parameter import parameter
 
 # Coverage is counted in this many cells across and down the photo.
 _COVERAGE_CELLS = (8, 6)
-# The least variance of a prior, as a share of the variance of a prior that comes without covariance: priors may claim
-# to know a coordinate exactly, as RViz's planar ones do.
-_MIN_VARIANCE_SHARE = 0.01
 
 
 # A right calibration reads as a longer or shorter focal length by at most this share, beside the reading's own
@@ -185,19 +181,3 @@ def coverage(pixels: np.ndarray, width: int, height: int) -> float:
     columns = np.clip((pixels[:, 0] + 0.5) * across // width, 0, across - 1).astype(int)
     rows = np.clip((pixels[:, 1] + 0.5) * down // height, 0, down - 1).astype(int)
     return len(np.unique(rows * across + columns)) / (across * down)
-
-
-def deviation(pose: np.ndarray, prior: np.ndarray, covariance: np.ndarray, default_covariance: np.ndarray) -> float:
-    """Return the Mahalanobis distance of a pose (4, 4) from a prior (4, 4).
-
-    Args:
-        pose, prior: T_map_camera.
-        covariance: (6, 6) of the prior. A hundredth of the default covariance is added.
-        default_covariance: (6, 6) diagonal, of a prior that comes without one.
-    """
-    step = np.concatenate([pose[:3, 3] - prior[:3, 3], so3_log(pose[:3, :3] @ prior[:3, :3].T)])
-    # In units of the default deviations; what is no covariance (correlations beyond 1) opens no gate.
-    unit = np.sqrt(default_covariance.diagonal())
-    values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T) / np.outer(unit, unit))
-    variances = np.clip(values, 0.0, None) + _MIN_VARIANCE_SHARE
-    return float(np.linalg.norm(vectors.T @ (step / unit) / np.sqrt(variances)))

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
-from gsfeatloc_ros.localize.evidence import deviation
+from gsfeatloc_ros.common.geometry import so3_log
 from gsfeatloc_ros.localize.options import LocalizerOptions
+
+# The least variance of a prior, as a share of the variance of a prior that comes without covariance: priors may claim
+# to know a coordinate exactly, as RViz's planar ones do.
+_MIN_VARIANCE_SHARE = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,5 +43,18 @@ class Prior:
         )
 
     def deviation(self, pose: np.ndarray) -> float:
-        """Return how far a pose (4, 4) is from it in standard deviations."""
-        return deviation(pose, self.pose, self.covariance, self.default_covariance)
+        """Return the Mahalanobis distance of a pose (4, 4) T_map_camera from it.
+
+        A hundredth of the default covariance is added to its own.
+        """
+        unit, axes, sigmas = self._spread
+        step = np.concatenate([pose[:3, 3] - self.pose[:3, 3], so3_log(pose[:3, :3] @ self.pose[:3, :3].T)])
+        return float(np.linalg.norm(axes.T @ (step / unit) / sigmas))
+
+    @cached_property
+    def _spread(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Units (6,) of the coordinates, axes (6, 6) of the covariance in these, and deviations (6,) along them."""
+        # In units of the default deviations; what is no covariance (correlations beyond 1) opens no gate.
+        unit = np.sqrt(self.default_covariance.diagonal())
+        values, axes = np.linalg.eigh(0.5 * (self.covariance + self.covariance.T) / np.outer(unit, unit))
+        return unit, axes, np.sqrt(np.clip(values, 0.0, None) + _MIN_VARIANCE_SHARE)
