@@ -114,6 +114,11 @@ def flattened(pose: np.ndarray) -> np.ndarray:
     return make_pose(so3_exp(np.array([0.0, 0.0, yaw])), [pose[0, 3], pose[1, 3], 0.0])
 
 
+def isotropic_covariance(translation: float, rotation: float) -> np.ndarray:
+    """Return the covariance (6, 6) of a pose of which all axes are known alike, by standard deviations (radians)."""
+    return np.diag(np.square([translation] * 3 + [rotation] * 3))
+
+
 def rotate_covariance(covariance: np.ndarray, rotation: np.ndarray) -> np.ndarray:
     """Turn the covariance (6, 6) of a pose from the axes of frame b to those of frame a, by R_a_b (3, 3)."""
     both = np.kron(np.eye(2), rotation)

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from gsfeatloc_ros.common.geometry import isotropic_covariance
 from gsfeatloc_ros.common.parameter import group, parameter
 from gsfeatloc_ros.localize.evidence import Limits
 from gsfeatloc_ros.pose.lift import LiftOptions
@@ -54,5 +55,4 @@ class LocalizerOptions:
 
     def prior_covariance(self) -> np.ndarray:
         """Covariance (6, 6) of a prior that comes without one: x y z, rotation vector; map units and radians."""
-        sigmas = [self.prior_translation] * 3 + [np.radians(self.prior_rotation)] * 3
-        return np.diag(np.square(sigmas))
+        return isotropic_covariance(self.prior_translation, np.radians(self.prior_rotation))

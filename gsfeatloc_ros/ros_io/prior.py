@@ -7,6 +7,7 @@ from enum import Enum
 
 import numpy as np
 
+from gsfeatloc_ros.common.geometry import isotropic_covariance
 from gsfeatloc_ros.ros_io.decode import decode_covariance, decode_pose, nanoseconds
 from gsfeatloc_ros.ros_io.growth import GrowthOptions
 from gsfeatloc_ros.ros_io.message_types import AnyPose
@@ -65,7 +66,7 @@ class PriorPolicy:
 
     def default_covariance(self) -> np.ndarray:
         """Return the covariance (6, 6) of a prior that comes without one."""
-        return np.diag(np.square([self.translation_sigma] * 3 + [np.radians(self.rotation_sigma)] * 3))
+        return isotropic_covariance(self.translation_sigma, np.radians(self.rotation_sigma))
 
     def plane(self) -> Prior:
         """Return the prior of a base that stands somewhere on the plane z = 0 of the map, upright."""
@@ -75,8 +76,8 @@ class PriorPolicy:
 
     def saved(self, T_map_camera: np.ndarray, sigma: float) -> Prior:
         """Return the prior that a pose (4, 4) of a run before is; the robot may be `sigma` map units away from it."""
-        variances = np.square([sigma] * 3 + [_SAVED_ROTATION] * 3)
-        return Prior(PriorSource.SAVED, 0, self.map_frame, False, T_map_camera, np.diag(variances))
+        covariance = isotropic_covariance(sigma, _SAVED_ROTATION)
+        return Prior(PriorSource.SAVED, 0, self.map_frame, False, T_map_camera, covariance)
 
 
 @dataclass(frozen=True, eq=False)
