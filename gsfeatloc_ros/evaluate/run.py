@@ -28,10 +28,11 @@ from gsfeatloc_ros.evaluate.protocol import PROTOCOLS, PhotoPrior, trajectory_ra
 from gsfeatloc_ros.evaluate.published import PublishedLocalizer
 from gsfeatloc_ros.evaluate.scene import load_degraded_renderer, load_scene, load_scene_renderer
 from gsfeatloc_ros.index import IndexOptions, ViewIndex, build_index
-from gsfeatloc_ros.index.storage import SUFFIX, load_index, save_index
+from gsfeatloc_ros.index.storage import SUFFIX
 from gsfeatloc_ros.localize.engine import load_matcher
 from gsfeatloc_ros.localize.estimate import Trace
 from gsfeatloc_ros.localize.localizer import Localizer
+from gsfeatloc_ros.localize.map_index import load_or_make
 from gsfeatloc_ros.localize.options import LocalizerOptions
 from gsfeatloc_ros.localize.query import Components
 from gsfeatloc_ros.localize.settings import MatcherSettings, RendererSettings
@@ -259,14 +260,11 @@ def _index(run: Run, drawn: DrawnMap, renderer: Renderer, matcher: Matcher) -> V
     """Make the index of views of a run's map by the run's seed, or read it where that was done before."""
     scene = open_scene(drawn.scene, drawn.map_path, drawn.version)
     poses = scene.training_poses() if run.index == "poses" else None
-    made_of = (str(drawn), run.matcher, run.index, run.seed, hash_of_sources("index", "match", "render", "maps"))
+    made_of = [str(drawn), run.matcher, run.index, run.seed, hash_of_sources("index", "match", "render", "maps")]
     name = hashlib.sha256(repr(made_of).encode()).hexdigest()[:16]
     path = user_cache_folder() / "evaluate" / f"{scene.name}-{name}{SUFFIX}"
-    index = load_index(path)
-    if index is None:
-        index = build_index(renderer, matcher, IndexOptions(seed=run.seed), poses=poses)
-        save_index(path, index, {"made of": made_of})
-    return index
+    options = IndexOptions(seed=run.seed)
+    return load_or_make(path, {"made of": made_of}, lambda: build_index(renderer, matcher, options, poses=poses))
 
 
 def _open(task: Task) -> tuple[Scene, tuple[np.ndarray, Camera]]:

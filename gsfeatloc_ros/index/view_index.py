@@ -23,6 +23,8 @@ _SEARCHED_LISTS = 12
 _VOTES = 8
 # Lowe's ratio in the matching with a view's few features.
 _MAX_DISTANCE_RATIO = 0.9
+# Descriptors that are decoded together.
+_BATCH = 100_000
 # Steps of a point's coordinate over the box of all points.
 _STEPS = 65535
 
@@ -95,16 +97,16 @@ class ViewIndex:
     @cached_property
     def centres(self) -> np.ndarray:
         """What the views look at: the medians (N, 3) of their points, map frame; of a view without any its place."""
-        steps = [
-            np.median(self.points[start:end], axis=0) if end > start else None
-            for start, end in pairwise(self._first.tolist())
-        ]
         return np.array(
             [
-                pose[:3, 3] if step is None else self.low + step / _STEPS * (self.high - self.low)
-                for pose, step in zip(self.poses, steps, strict=True)
+                np.median(self._points(slice(start, end)), axis=0) if end > start else pose[:3, 3]
+                for pose, (start, end) in zip(self.poses, pairwise(self._first.tolist()), strict=True)
             ]
         ).reshape(-1, 3)
+
+    def prepare(self) -> None:
+        """Make what the first search would make otherwise: seconds for a large index."""
+        _ = self._search, self.centres
 
     @staticmethod
     def compress(poses: np.ndarray, descriptors: list[np.ndarray], points: list[np.ndarray]) -> ViewIndex:
@@ -178,7 +180,3 @@ class ViewIndex:
         for start in range(0, len(self.codes), _BATCH):
             search.add(self._decoded(self.codes[start : start + _BATCH]))
         return search
-
-
-# Descriptors that are decoded together.
-_BATCH = 100_000

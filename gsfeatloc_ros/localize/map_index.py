@@ -43,19 +43,35 @@ def index_for(
         ValueError, OSError: there is none and none can be made; the message says why.
     """
     path = Path(options.path) if options.path else index_path(engine.map_path)
-    try:
-        found = load_index(path, key)
-    except (ValueError, OSError) as error:
-        _log.warning("%s: the index of views is made again", error)
-        found = None
-    if found is not None or not options.build:
+    if not options.build:
+        return _usable(path, key)
+    return load_or_make(path, key, lambda: build_index(engine.renderer, engine.matcher, options, progress, interrupted))
+
+
+def load_or_make(path: Path, key: dict[str, Any], make: Callable[[], ViewIndex]) -> ViewIndex:
+    """Read an index that was made of `key`; where there is none, make it and write it, and say where that fails."""
+    found = _usable(path, key)
+    if found is not None:
         return found
-    made = build_index(engine.renderer, engine.matcher, options, progress, interrupted)
+    made = make()
     try:
         save_index(path, made, key)
     except OSError as error:
         _log.warning("%s: cannot be written, the index is made again next time: %s", path, error.strerror or error)
     return made
+
+
+def _usable(path: Path, key: dict[str, Any]) -> ViewIndex | None:
+    """Read an index that was made of `key`, ready to be searched; None where there is none that can be used."""
+    try:
+        found = load_index(path, key)
+    except (ValueError, OSError) as error:
+        _log.warning("%s: the index of views is made again", error)
+        return None
+    if found is not None:
+        # Here, not at the first image.
+        found.prepare()
+    return found
 
 
 def index_key(map_path: str, map_: MapSettings, matcher: MatcherSettings) -> dict[str, Any]:
