@@ -112,9 +112,8 @@ def overlap(photos: Sequence[set[int]], views: Sequence[set[int]]) -> np.ndarray
         starts = np.concatenate([[0], np.cumsum([len(cells_seen) for cells_seen in seen])])
         return csr_array((np.ones(len(columns), np.float32), columns, starts), (len(seen), max(len(numbers), 1)))
 
-    incidence(photos)
-    of_views = incidence(views)
-    of_photos = incidence(photos)
+    of_photos, of_views = incidence(photos), incidence(views)
+    # The views show cells that no photo does.
     of_photos.resize((len(photos), of_views.shape[1]))
     sizes = np.maximum([len(photo) for photo in photos], 1).astype(np.float32)
     return np.asarray((of_photos @ of_views.T).todense(), np.float32) / sizes[:, None]

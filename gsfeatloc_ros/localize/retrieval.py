@@ -49,9 +49,13 @@ def retrieve(small: Query, index: ViewIndex, likely: Callable[[np.ndarray], bool
     features = small.features
     if not isinstance(features, Features):
         return
+
+    def weight(pose: np.ndarray) -> float:
+        return 1.0 if likely(pose) else 1.0 / _WEIGHT_OF_PRIOR
+
     with small.clock.stage("search"):
         found = features.on_host()
-        weights = np.where([likely(pose) for pose in index.poses], 1.0, 1.0 / _WEIGHT_OF_PRIOR)
+        weights = np.array([weight(pose) for pose in index.poses])
         order = np.argsort(-index.rank(found) * weights, kind="stable")
     group = _Group(small, index, found, order)
     for view in order:
@@ -60,7 +64,8 @@ def retrieve(small: Query, index: ViewIndex, likely: Callable[[np.ndarray], bool
         if hint is None:
             yield None
         else:
-            yield Hint(hint[0], hint[1], hint[1] * (1.0 if likely(hint[0]) else 1.0 / _WEIGHT_OF_PRIOR))
+            pose, inliers = hint
+            yield Hint(pose, inliers, inliers * weight(pose))
 
 
 class _Group:
