@@ -36,14 +36,14 @@ def random_similarity(seed: int) -> Similarity:
 
 
 def random_map(seed: int) -> GaussianMap:
-    """Gaussians of SH degree 1 ahead of the origin."""
+    """Gaussians of SH degree 1 ahead of the origin, so opaque that enough pixels have a depth."""
     rng = np.random.default_rng(seed)
     rotations = rng.normal(size=(300, 4))
     return GaussianMap(
         means=rng.uniform([-3, -2, 1], [3, 2, 6], (300, 3)).astype(np.float32),
         scales=np.exp(rng.uniform(-5, -0.5, (300, 3))).astype(np.float32),
         rotations=(rotations / np.linalg.norm(rotations, axis=1, keepdims=True)).astype(np.float32),
-        opacities=rng.uniform(0.1, 1, 300).astype(np.float32),
+        opacities=rng.uniform(0.4, 1, 300).astype(np.float32),
         sh=rng.normal(scale=0.3, size=(300, 4, 3)).astype(np.float32),
     )
 
