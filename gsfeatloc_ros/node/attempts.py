@@ -16,13 +16,14 @@ from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.stage_clock import Interrupted
 from gsfeatloc_ros.index import ViewIndex
 from gsfeatloc_ros.localize.engine import Engine
-from gsfeatloc_ros.localize.options import MAX_SEED, LocalizerOptions
+from gsfeatloc_ros.localize.options import LocalizerOptions
 from gsfeatloc_ros.node.diagnostics import prior_texts, protection_texts
 from gsfeatloc_ros.node.pose_file import PoseFile
-from gsfeatloc_ros.node.publishers import Answer, Extrinsics, Publishers
+from gsfeatloc_ros.node.publishers import Answer, Publishers
 from gsfeatloc_ros.node.report import Report
 from gsfeatloc_ros.node.standing import StandingPublisher
 from gsfeatloc_ros.node.worker import Worker
+from gsfeatloc_ros.ros_io.extrinsics import Extrinsics
 from gsfeatloc_ros.ros_io.follower import Follower
 from gsfeatloc_ros.ros_io.inputs import LocalizerInput
 from gsfeatloc_ros.ros_io.outcome import Outcome
@@ -194,13 +195,8 @@ class Attempts:
         return result
 
     def _options(self, options: LocalizerOptions, job: Job, query: LocalizerInput) -> LocalizerOptions:
-        """Return the options for a job.
-
-        What was searched in vain is searched otherwise, with another seed.
-        """
-        failures = self._follower.state.failures
-        if failures:
-            options = replace(options, seed=(options.seed + failures) % (MAX_SEED + 1))
+        """Return the options for a job."""
+        options = self._follower.options(options)
         if job.max_seconds > 0:
             options = replace(options, search=replace(options.search, max_seconds=job.max_seconds))
         return options
@@ -212,7 +208,7 @@ class Attempts:
         T_map_camera = estimate.T_map_camera
         judgement = self._follower.take(query, header, T_map_camera)
         if judgement.decision is Decision.AWAIT:
-            result = replace(result, outcome=Outcome.unconfirmed(estimate, judgement.note), answer=None)
+            result = replace(result, outcome=Outcome.of(estimate, judgement), answer=None)
         elif result.answer is not None and T_map_camera is not None:
             outputs.report.count_answer()
             outputs.publishers.publish_answer(result.answer, T_map_camera, extrinsics)

@@ -9,7 +9,7 @@ from gsfeatloc_ros.localize.engine import Engine
 from gsfeatloc_ros.localize.map_index import index_for, index_key
 from gsfeatloc_ros.node.attempts import Attempts
 from gsfeatloc_ros.node.diagnostics import ERROR, OK, WARN, Reporter
-from gsfeatloc_ros.node.settings import Settings
+from gsfeatloc_ros.ros_io.settings import Settings
 
 # Seconds between two words on how far it is.
 _PROGRESS_PERIOD = 2.0

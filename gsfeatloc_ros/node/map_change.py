@@ -11,7 +11,7 @@ from rclpy.parameter import Parameter
 from gsfeatloc_ros.localize.engine import Engine, load_renderer
 from gsfeatloc_ros.node.diagnostics import ERROR, OK, Reporter
 from gsfeatloc_ros.node.session import Session
-from gsfeatloc_ros.node.settings import Settings
+from gsfeatloc_ros.ros_io.settings import Settings
 
 PATH = "map.path"
 

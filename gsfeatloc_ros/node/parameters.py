@@ -9,7 +9,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
 from gsfeatloc_ros.common.parameter import Parameter
-from gsfeatloc_ros.node.settings import PARAMETERS, Settings
+from gsfeatloc_ros.ros_io.settings import PARAMETERS, Settings
 
 # Names that are accepted for one more release, though they have no effect, and what to set instead.
 _RETIRED = {

@@ -13,43 +13,19 @@ from rclpy.node import Node
 from sensor_msgs.msg import CompressedImage, Image
 from std_msgs.msg import Header
 
-from gsfeatloc_ros.common.geometry import flattened, invert, shift_covariance
 from gsfeatloc_ros.localize.estimate import Estimate, Trace
 from gsfeatloc_ros.localize.protection import ProtectionLevel, protection_level
 from gsfeatloc_ros.node.encode import image_message, pose_array_message, pose_message, protection_message
 from gsfeatloc_ros.node.interfaces import ProtectionLevelMessage
 from gsfeatloc_ros.node.qos import LATCHED, RELIABLE, overridable
-from gsfeatloc_ros.node.settings import BASE, Settings
 from gsfeatloc_ros.node.transforms import Transforms
 from gsfeatloc_ros.ros_io.debug_picture import draw, draw_refused
 from gsfeatloc_ros.ros_io.decode import decode_picture, nanoseconds
+from gsfeatloc_ros.ros_io.extrinsics import Extrinsics
+from gsfeatloc_ros.ros_io.settings import Settings
 
 # Seconds between two broadcasts of the odometry's frame: as AMCL at the rate of a laser.
 _TRANSFORM_PERIOD = 0.05
-
-
-@dataclass(frozen=True, eq=False)
-class Extrinsics:
-    """Where parts of the robot were at an image's stamp, as far as it is needed to publish the answer.
-
-    Attributes:
-        T_camera_body: (4, 4) of the body that answers are poses of: the base, or the camera itself.
-        T_camera_odom: (4, 4) of the odometry's frame; None where no transform is broadcast.
-        T_camera_base: (4, 4) of the base; None unless the transform is kept flat.
-    """
-
-    T_camera_body: np.ndarray
-    T_camera_odom: np.ndarray | None
-    T_camera_base: np.ndarray | None
-
-    def T_map_odom(self, T_map_camera: np.ndarray) -> np.ndarray | None:
-        """Return the transform (4, 4) that follows from a pose (4, 4) of the camera; None where none is broadcast."""
-        if self.T_camera_odom is None:
-            return None
-        if self.T_camera_base is None:
-            return T_map_camera @ self.T_camera_odom
-        T_odom_base = invert(self.T_camera_odom) @ self.T_camera_base
-        return flattened(T_map_camera @ self.T_camera_base) @ invert(flattened(T_odom_base))
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,17 +57,14 @@ class Publishers:
     def __init__(self, node: Node, settings: Settings, transforms: Transforms, is_lost: Callable[[], bool]) -> None:
         self._node, self._is_lost = node, is_lost
         self._transforms = transforms
-        self._map_frame, self._base_frame = settings.map.frame_id, settings.node.base_frame
-        self._of_base = settings.node.pose_frame == BASE
-        self._odom_frame = settings.node.odom_frame if settings.node.publish_tf else ""
-        self._flat = settings.node.planar_tf
+        self._map_frame, self._frames = settings.map.frame_id, settings.node.answer_frames()
         self._tolerance = Duration(nanoseconds=int(1e9 * settings.node.transform_tolerance))
         self._T_map_odom: np.ndarray | None = None
         # An answer and the timer broadcast in threads of their own; stamps must not go back.
         self._broadcast_lock = Lock()
         # Of the image last answered, in nanoseconds.
         self.last_stamp: int | None = None
-        if self._odom_frame and not settings.map.aligned:
+        if self._frames.odom and not settings.map.aligned:
             raise ValueError(
                 "publish_tf needs map.aligned: set it to true once map.scale, map.translation and map.rotation put the "
                 "map where the robot's map frame is; other nodes would believe a pose that is off"
@@ -101,7 +74,7 @@ class Publishers:
                 "search.planar needs map.aligned: set it to true once map.scale, map.translation and map.rotation put "
                 "the map where the floor is z = 0"
             )
-        if self._odom_frame or self._of_base or settings.recovery.planar:
+        if self._frames.odom or self._frames.body or settings.recovery.planar:
             transforms.listen()
         self._pose = node.create_publisher(
             PoseWithCovarianceStamped, "pose", LATCHED, qos_overriding_options=overridable()
@@ -117,7 +90,7 @@ class Publishers:
             PoseArray, "~/candidates", RELIABLE, qos_overriding_options=overridable()
         )
         self._changed = node.create_publisher(Image, "~/changed", RELIABLE, qos_overriding_options=overridable())
-        self._timer = node.create_timer(_TRANSFORM_PERIOD, self._broadcast) if self._odom_frame else None
+        self._timer = node.create_timer(_TRANSFORM_PERIOD, self._broadcast) if self._frames.odom else None
 
     @property
     def topic(self) -> str:
@@ -146,23 +119,13 @@ class Publishers:
             header: the image's.
             shared: whether the answer is for all, tf among them.
         """
-        stamp, camera_frame = nanoseconds(header.stamp), header.frame_id
-        T_camera_body, T_camera_odom, T_camera_base = np.eye(4), None, None
-        if self._of_base:
-            T_camera_body = self._transforms.lookup(camera_frame, self._base_frame, stamp)
-        if self._odom_frame and shared:
-            T_camera_odom = self._transforms.lookup(camera_frame, self._odom_frame, stamp)
-            if self._flat:
-                T_camera_base = self._transforms.lookup(camera_frame, self._base_frame, stamp)
-        return Extrinsics(T_camera_body, T_camera_odom, T_camera_base)
+        return self._frames.extrinsics(self._transforms.lookup, header, shared)
 
     def answer(self, estimate: Estimate, extrinsics: Extrinsics, header: Header) -> Answer | None:
         """Return the answer to the image of a header; None where the estimate is none."""
         if estimate.T_map_camera is None or estimate.covariance is None:
             return None
-        T_map_body = estimate.T_map_camera @ extrinsics.T_camera_body
-        lever = T_map_body[:3, 3] - estimate.T_map_camera[:3, 3]
-        covariance = shift_covariance(estimate.covariance, lever)
+        T_map_body, covariance = extrinsics.of_body(estimate.T_map_camera, estimate.covariance)
         pose = pose_message(T_map_body, covariance, Header(stamp=header.stamp, frame_id=self._map_frame))
         return Answer(pose, protection_level(covariance))
 
@@ -225,4 +188,4 @@ class Publishers:
             T_map_odom = self._T_map_odom
             if T_map_odom is not None and not self._is_lost():
                 stamp = (self._node.get_clock().now() + self._tolerance).to_msg()
-                self._transforms.broadcast(self._map_frame, self._odom_frame, T_map_odom, stamp)
+                self._transforms.broadcast(self._map_frame, self._frames.odom, T_map_odom, stamp)

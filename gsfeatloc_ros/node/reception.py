@@ -15,9 +15,10 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from gsfeatloc_ros.node.attempts import Job
 from gsfeatloc_ros.node.qos import NEWEST, ODOMETRY, RELIABLE, Topic, subscribe
 from gsfeatloc_ros.node.report import Report
-from gsfeatloc_ros.node.settings import COMPRESSED, ON_PRIOR, ON_REQUEST, Settings
 from gsfeatloc_ros.ros_io.decode import nanoseconds, validate_image
 from gsfeatloc_ros.ros_io.inputs import Inputs, InputTopic
+from gsfeatloc_ros.ros_io.schedule import Schedule
+from gsfeatloc_ros.ros_io.settings import COMPRESSED, Settings
 
 _TOPICS = (
     (Topic(CameraInfo, "camera_info", NEWEST), InputTopic.CAMERA_INFO),
@@ -54,9 +55,7 @@ class Reception:
         self.no_image = f"no image yet: publish sensor_msgs/{image_type.__name__} on {resolved}"
         # The newest image, or why it cannot be used.
         self._job: Job | str = self.no_image
-        self._prior_pending = False
-        # Stamp of the last image that was offered, in nanoseconds.
-        self._last_offered = 0
+        self._schedule = Schedule(settings.node)
         self._subscriptions: list[Subscription] = []
 
     @property
@@ -81,6 +80,7 @@ class Reception:
     def use_settings(self, settings: Settings) -> None:
         """Go on with other settings, as far as they can change."""
         self._settings = settings
+        self._schedule.settings = settings.node
 
     def newest(self) -> Job:
         """Return the newest image as a job; raise ValueError, which names all that is missing, where it cannot be."""
@@ -107,20 +107,8 @@ class Reception:
             self._report.refuse("image", str(error), message.header.stamp)
             return
         self._job = Job(message)
-        if self._is_due(nanoseconds(message.header.stamp)):
+        if self._schedule.is_due(nanoseconds(message.header.stamp) or self._node.get_clock().now().nanoseconds):
             self._offer(self._job)
-
-    def _is_due(self, stamp: int) -> bool:
-        """Return whether an image is to be localized without being asked for, and note that it is."""
-        mode, max_rate = self._settings.node.mode, self._settings.node.max_rate
-        stamp = stamp or self._node.get_clock().now().nanoseconds
-        if mode == ON_REQUEST or (mode == ON_PRIOR and not self._prior_pending):
-            return False
-        # Stamps that go back are those of a bag that starts anew.
-        if max_rate and 0 <= stamp - self._last_offered < 1e9 / max_rate:
-            return False
-        self._prior_pending, self._last_offered = False, stamp
-        return True
 
     def _on_input(self, topic: InputTopic, message: Any) -> None:
         taken = True
@@ -130,4 +118,4 @@ class Reception:
             taken = False
             self._report.refuse(topic.value, str(error), message.header.stamp)
         if topic in (InputTopic.PRIOR, InputTopic.INITIAL_POSE):
-            self._prior_pending = taken
+            self._schedule.take_prior(taken)

@@ -15,11 +15,11 @@ from gsfeatloc_ros.node.pose_file import PoseFile
 from gsfeatloc_ros.node.publishers import Publishers
 from gsfeatloc_ros.node.reception import Reception
 from gsfeatloc_ros.node.report import Report
-from gsfeatloc_ros.node.settings import CONTINUOUS, ON_REQUEST, Settings
 from gsfeatloc_ros.node.standing import StandingPublisher
 from gsfeatloc_ros.node.transforms import Transforms
 from gsfeatloc_ros.ros_io.follower import Follower
 from gsfeatloc_ros.ros_io.inputs import Inputs
+from gsfeatloc_ros.ros_io.settings import CONTINUOUS, ON_REQUEST, Settings
 from gsfeatloc_ros.ros_io.state import LocalizationState, State
 
 # Seconds between two reports on the node's health, as of diagnostic_updater, and between two saves of the last pose.

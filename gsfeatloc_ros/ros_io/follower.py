@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from gsfeatloc_ros.common.camera import Camera
+from gsfeatloc_ros.localize.options import MAX_SEED, LocalizerOptions
 from gsfeatloc_ros.ros_io.decode import nanoseconds
 from gsfeatloc_ros.ros_io.inputs import Inputs, LocalizerInput
 from gsfeatloc_ros.ros_io.message_types import AnyImage, Header
@@ -37,6 +40,10 @@ class Follower:
             self._inputs.forget_answer()
             query = self._inputs.for_image(message, camera, prior)
         return query
+
+    def options(self, options: LocalizerOptions) -> LocalizerOptions:
+        """Return the options for the next image: what was searched in vain is searched otherwise, with another seed."""
+        return replace(options, seed=(options.seed + self.state.failures) % (MAX_SEED + 1))
 
     def take(self, query: LocalizerInput, header: Header, T_map_camera: np.ndarray | None) -> Judgement:
         """Take what came of an image that came by itself, and return what is to be done.

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from enum import Enum
 
 from gsfeatloc_ros.localize.estimate import Estimate
+from gsfeatloc_ros.ros_io.state import Decision, Judgement
 
 
 class OutcomeStatus(Enum):
@@ -36,14 +37,11 @@ class Outcome:
     estimate: Estimate | None = None
 
     @staticmethod
-    def of(estimate: Estimate) -> Outcome:
-        """Return the outcome that an estimate is."""
+    def of(estimate: Estimate, judgement: Judgement | None = None) -> Outcome:
+        """Return the outcome that an estimate is, after a judgement: another image may have to confirm it."""
+        if judgement is not None and judgement.decision is Decision.AWAIT:
+            return Outcome(OutcomeStatus.UNCONFIRMED, f"{judgement.note}: {estimate.reason}", estimate)
         return Outcome(OutcomeStatus(estimate.status.value), estimate.reason, estimate)
-
-    @staticmethod
-    def unconfirmed(estimate: Estimate, note: str) -> Outcome:
-        """Return the outcome of an image whose answer another one has to confirm; the note says why."""
-        return Outcome(OutcomeStatus.UNCONFIRMED, f"{note}: {estimate.reason}", estimate)
 
     @staticmethod
     def refused(reason: object) -> Outcome:

@@ -3,7 +3,7 @@
     python -m gsfeatloc_ros.tools.parameters            after a setting was changed
     python -m gsfeatloc_ros.tools.parameters --check    exits with 1 where a file is not as it would be written
 
-The settings are the dataclasses of node/settings.py and localize/. It needs no ROS, but the repository.
+The settings are the dataclasses of ros_io/settings.py and localize/. It needs no ROS, but the repository.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from itertools import groupby
 from pathlib import Path
 
 from gsfeatloc_ros.common.parameter import Parameter, Value
-from gsfeatloc_ros.node.settings import PARAMETERS
+from gsfeatloc_ros.ros_io.settings import PARAMETERS
 
 _YAML_HEAD = """\
 # Every parameter of the localizer node, with its default. It is read when the node starts; some can be set later too.

@@ -16,7 +16,7 @@ import yaml
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from rclpy.lifecycle import LifecycleNode
 
-from gsfeatloc_ros.node.settings import PARAMETERS
+from gsfeatloc_ros.ros_io.settings import PARAMETERS
 
 ROOT = Path(__file__).parents[2]
 TOPICS = (ROOT / "docs/topics-and-services.md").read_text(encoding="utf-8")

@@ -12,7 +12,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from gsfeatloc_ros.node.parameters import declare_parameters, read_settings, without_retired
-from gsfeatloc_ros.node.settings import PARAMETERS, Settings
+from gsfeatloc_ros.ros_io.settings import PARAMETERS, Settings
 
 RETIRED = ["localizer.min_inlier_ratio", "localizer.min_correlation", "localizer.min_agreement"]
 

@@ -7,6 +7,7 @@ import pytest
 
 from gsfeatloc_ros.localize.estimate import Estimate, Status
 from gsfeatloc_ros.ros_io.outcome import Outcome, OutcomeStatus
+from gsfeatloc_ros.ros_io.state import Decision, Judgement
 
 
 @pytest.mark.parametrize("status", Status)
@@ -31,7 +32,7 @@ def test_a_bug_is_an_error_and_no_refusal():
 
 def test_an_answer_to_be_confirmed_is_none_yet():
     estimate = Estimate(Status.LOCALIZED, "30 inliers", np.eye(4), np.eye(6))
-    unconfirmed = Outcome.unconfirmed(estimate, "the next image has to agree")
+    unconfirmed = Outcome.of(estimate, Judgement(Decision.AWAIT, "the next image has to agree"))
     assert (unconfirmed.status, unconfirmed.estimate) == (OutcomeStatus.UNCONFIRMED, estimate)
     assert unconfirmed.reason == "the next image has to agree: 30 inliers"
     assert not unconfirmed.localized

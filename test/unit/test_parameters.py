@@ -16,9 +16,9 @@ from gsfeatloc_ros.common.geometry import quaternion_from_matrix, so3_exp
 from gsfeatloc_ros.localize.options import LocalizerOptions
 from gsfeatloc_ros.localize.settings import MapSettings
 from gsfeatloc_ros.maps import Similarity
-from gsfeatloc_ros.node.settings import PARAMETERS, ImageSettings, NodeSettings, RecoverySettings, Settings
 from gsfeatloc_ros.ros_io.growth import GrowthOptions
 from gsfeatloc_ros.ros_io.prior import PriorPolicy
+from gsfeatloc_ros.ros_io.settings import PARAMETERS, ImageSettings, NodeSettings, RecoverySettings, Settings
 from gsfeatloc_ros.tools.parameters import main, page_text, yaml_text
 
 ROOT = Path(__file__).parents[2]

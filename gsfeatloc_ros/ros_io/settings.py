@@ -1,4 +1,4 @@
-"""The node's settings, which are its ROS parameters. This imports nothing of ROS."""
+"""The settings of the node, and of replay: the ROS parameters. This imports nothing of ROS."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from gsfeatloc_ros.common.parameter import Parameter, Value, parameter, paramete
 from gsfeatloc_ros.index import IndexOptions
 from gsfeatloc_ros.localize.options import LocalizerOptions
 from gsfeatloc_ros.localize.settings import MapSettings, MatcherSettings, RendererSettings
+from gsfeatloc_ros.ros_io.extrinsics import AnswerFrames
 from gsfeatloc_ros.ros_io.growth import GrowthOptions
 from gsfeatloc_ros.ros_io.prior import PriorPolicy
 from gsfeatloc_ros.ros_io.state import StateOptions
@@ -68,6 +69,14 @@ class NodeSettings:
         "Seconds over which odometry carries a prior, or the last answer, to the image's time.",
         (0.0, 3600.0),
     )
+
+    def answer_frames(self) -> AnswerFrames:
+        """Return which frames answers need."""
+        return AnswerFrames(
+            body=self.base_frame if self.pose_frame == BASE else "",
+            odom=self.odom_frame if self.publish_tf else "",
+            flat_base=self.base_frame if self.planar_tf else "",
+        )
 
 
 @dataclass(frozen=True)
