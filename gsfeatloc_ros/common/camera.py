@@ -20,7 +20,7 @@ class Camera:
 
     Attributes:
         width, height: image size in pixels.
-        K: (3, 3) float64 intrinsic matrix in pixels.
+        K: (3, 3) float64 intrinsic matrix in pixels; its skew K[0, 1] counts as part of the distortion.
         distortion: (n,) float64 coefficients in OpenCV's order for `model`; empty or all zero means none (for the
             equidistant model: an ideal fisheye).
         model: "plumb_bob", "rational_polynomial" or "equidistant" (fisheye), as in sensor_msgs/CameraInfo.
@@ -91,44 +91,67 @@ class Camera:
 
     @property
     def distorted(self) -> bool:
-        """Whether the lens is anything but a pinhole; a fisheye without coefficients is."""
-        return self.model == "equidistant" or bool(self.distortion.any())
+        """Whether the camera is anything but a pinhole without skew; a fisheye without coefficients is."""
+        return self.model == "equidistant" or bool(self.distortion.any()) or self._skew != 0
 
     def pinhole(self) -> Camera:
-        """Return the camera with the same K that does not distort."""
-        return replace(self, distortion=np.zeros(0), model="plumb_bob")
+        """Return the camera with the same K, but for its skew, that does not distort."""
+        return replace(self, K=self._K_pinhole, distortion=np.zeros(0), model="plumb_bob")
 
     def undistort(self, pixels: np.ndarray) -> np.ndarray:
-        """Move observed pixels (N, 2) to where a pinhole camera with the same K would see them: (N, 2) float64."""
-        pixels = np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
+        """Move observed pixels (N, 2) to where `pinhole()` would see them: (N, 2) float64."""
+        pixels = np.array(pixels, dtype=np.float64).reshape(-1, 2)
         if len(pixels) == 0 or not self.distorted:
-            return pixels.copy()
+            return pixels
+        K = self._K_pinhole
+        pixels[:, 0] -= self._skew * (pixels[:, 1] - K[1, 2]) / K[1, 1]
         points = pixels.reshape(-1, 1, 2)
         if self.model == "equidistant":
-            undistorted = cv2.fisheye.undistortPoints(points, self.K, self._fisheye_coefficients, P=self.K)
+            undistorted = cv2.fisheye.undistortPoints(points, K, self._fisheye_coefficients, P=K)
         else:
             criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-10)
-            undistorted = cv2.undistortImagePoints(points, self.K, self.distortion, None, criteria)
+            undistorted = cv2.undistortImagePoints(points, K, self.distortion, None, criteria)
         return undistorted.reshape(-1, 2)
 
     def undistort_image(self, image: np.ndarray) -> np.ndarray:
-        """Return the image (H, W, C) of a pinhole camera with the same K; it is black where the lens saw nothing."""
+        """Return the image (H, W, C) of `pinhole()`; it is black where the lens saw nothing."""
         if not self.distorted:
             return image
+        if self._skew != 0:
+            return self._undistort_skewed(image)
         if self.model == "equidistant":
             return cv2.fisheye.undistortImage(image, self.K, self._fisheye_coefficients, Knew=self.K)
         return cv2.undistort(image, self.K, self.distortion)
+
+    def _undistort_skewed(self, image: np.ndarray) -> np.ndarray:
+        """Do as `undistort_image`, for a K with skew, which OpenCV knows nothing of."""
+        K, size = self._K_pinhole, (self.width, self.height)
+        if self.model == "equidistant":
+            x, y = cv2.fisheye.initUndistortRectifyMap(K, self._fisheye_coefficients, np.eye(3), K, size, cv2.CV_32FC1)
+        else:
+            x, y = cv2.initUndistortRectifyMap(K, self.distortion, None, K, size, cv2.CV_32FC1)
+        x += (self._skew / K[1, 1]) * (y - K[1, 2])
+        return cv2.remap(image, x, y, cv2.INTER_LINEAR)
+
+    @property
+    def _skew(self) -> float:
+        """How far, in pixels, a ray of slope 1 in y is moved along x."""
+        return float(self.K[0, 1])
+
+    @property
+    def _K_pinhole(self) -> np.ndarray:
+        return self.K * [[1, 0, 1], [1, 1, 1], [1, 1, 1]]
 
     @property
     def _fisheye_coefficients(self) -> np.ndarray:
         return self.distortion if len(self.distortion) else np.zeros(4)
 
     def project(self, points: np.ndarray) -> np.ndarray:
-        """Project camera-frame points (N, 3) with z > 0 to pinhole pixels (N, 2), without distortion."""
-        homogeneous = points @ self.K.T
+        """Project camera-frame points (N, 3) with z > 0 to the pixels (N, 2) of `pinhole()`."""
+        homogeneous = points @ self._K_pinhole.T
         return homogeneous[:, :2] / homogeneous[:, 2:]
 
     def rays(self, pixels: np.ndarray) -> np.ndarray:
         """Return the camera-frame directions (N, 3) with z = 1 through undistorted pixels (N, 2)."""
         homogeneous = np.column_stack([pixels, np.ones(len(pixels))])
-        return homogeneous @ np.linalg.inv(self.K).T
+        return homogeneous @ np.linalg.inv(self._K_pinhole).T

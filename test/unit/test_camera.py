@@ -63,6 +63,48 @@ def test_undistort_inverts_the_lens(model, coefficients):
     np.testing.assert_allclose(camera.undistort(observed), pinhole, atol=1e-3)
 
 
+def observed_by_the_definition(camera: Camera, slopes: np.ndarray) -> np.ndarray:
+    """Pixels (N, 2) that see the slopes (N, 2) x/z and y/z, by the models' formulas and the whole K; without OpenCV."""
+    x, y = slopes.T
+    r = np.hypot(x, y)
+    if camera.model == "equidistant":
+        theta, powers = np.arctan(r), np.arange(3, 10, 2)
+        bent = theta + (camera.distortion[:, None] * theta ** powers[:, None]).sum(axis=0)
+        x, y = x * bent / np.maximum(r, 1e-12), y * bent / np.maximum(r, 1e-12)
+    else:
+        k1, k2, p1, p2, k3, k4, k5, k6 = np.pad(camera.distortion, (0, 8 - len(camera.distortion)))
+        radial = (1 + k1 * r**2 + k2 * r**4 + k3 * r**6) / (1 + k4 * r**2 + k5 * r**4 + k6 * r**6)
+        x, y = (
+            x * radial + 2 * p1 * x * y + p2 * (r**2 + 2 * x**2),
+            y * radial + p1 * (r**2 + 2 * y**2) + 2 * p2 * x * y,
+        )
+    return np.column_stack([x, y, np.ones_like(x)]) @ camera.K[:2].T
+
+
+@pytest.mark.parametrize("skew", [-20.0, 5.0])
+@pytest.mark.parametrize(("model", "coefficients"), [*LENSES, ("plumb_bob", [])])
+def test_skew_is_undistorted_with_the_lens(model, coefficients, skew):
+    """Pixels, and pictures of a smooth pattern, which the definition says where to look for."""
+    skewed = Camera(640, 480, K + [[0, skew, 0], [0, 0, 0], [0, 0, 0]], np.array(coefficients), model)
+    columns, rows = np.meshgrid(np.linspace(0, 639, 9), np.linspace(0, 479, 9))
+    slopes = (np.column_stack([columns.ravel(), rows.ravel()]) - K[:2, 2]) / K[[0, 1], [0, 1]]
+    seen_at = skewed.undistort(observed_by_the_definition(skewed, slopes))
+    np.testing.assert_allclose(seen_at, slopes * K[[0, 1], [0, 1]] + K[:2, 2], atol=1e-3)
+    np.testing.assert_array_equal(skewed.pinhole().K, K)
+    np.testing.assert_allclose(skewed.rays(seen_at)[:, :2], slopes, atol=1e-5)
+
+    def pattern(x, y):
+        return 128 + 50 * np.sin(0.05 * x) + 50 * np.cos(0.03 * y)
+
+    y, x = np.mgrid[:480, :640]
+    undistorted = skewed.undistort_image(pattern(x, y).astype(np.float32))
+    slopes = np.column_stack([(x.ravel() - K[0, 2]) / K[0, 0], (y.ravel() - K[1, 2]) / K[1, 1]])
+    observed_x, observed_y = observed_by_the_definition(skewed, slopes).T.reshape(2, 480, 640)
+    inside = (observed_x > 0) & (observed_x < 639) & (observed_y > 0) & (observed_y < 479)
+    assert inside.mean() > 0.5
+    assert np.abs(undistorted - pattern(observed_x, observed_y))[inside].max() < 0.5
+
+
 @pytest.mark.parametrize(("model", "coefficients"), LENSES)
 def test_undistort_of_no_pixels(model, coefficients):
     assert Camera(640, 480, K, np.array(coefficients), model).undistort(np.zeros((0, 2))).shape == (0, 2)
