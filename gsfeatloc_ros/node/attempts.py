@@ -170,7 +170,7 @@ class Attempts:
             extrinsics = publishers.extrinsics(header, job.shared)
         except ValueError as error:
             if job.shared and self.publishing:
-                publishers.publish_refused(job.message, str(error))
+                publishers.publish_refused(job.message, error)
             return JobResult(Outcome.refused(error))
         localizer = engine.with_options(self._options(engine.options, job, query)).localizer
         trace = localizer.trace(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from threading import Lock
 
@@ -20,12 +21,14 @@ from gsfeatloc_ros.node.interfaces import ProtectionLevelMessage
 from gsfeatloc_ros.node.qos import LATCHED, RELIABLE, overridable
 from gsfeatloc_ros.node.transforms import Transforms
 from gsfeatloc_ros.ros_io.debug_picture import draw, draw_refused
-from gsfeatloc_ros.ros_io.decode import decode_picture, nanoseconds
+from gsfeatloc_ros.ros_io.decode import PictureError, decode_picture, nanoseconds
 from gsfeatloc_ros.ros_io.extrinsics import Extrinsics
 from gsfeatloc_ros.ros_io.settings import Settings
 
 # Seconds between two broadcasts of the odometry's frame: as AMCL at the rate of a laser.
 _TRANSFORM_PERIOD = 0.05
+# What is shown for a picture that is not decoded.
+_NO_PICTURE = np.zeros((480, 640, 3), np.uint8)
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,14 +173,17 @@ class Publishers:
         if self._debug.get_subscription_count() > 0:
             self._debug.publish(image_message(draw(trace), header))
 
-    def publish_refused(self, message: Image | CompressedImage, reason: str) -> None:
-        """Publish an image that was not tried, if it is one, with the reason, if somebody subscribes."""
+    def publish_refused(self, message: Image | CompressedImage, error: ValueError) -> None:
+        """Publish an image that was not tried, with the reason, if somebody subscribes.
+
+        A compressed picture that was refused for itself is not decoded for this: it may be one that takes long.
+        """
         if self._debug.get_subscription_count() > 0:
-            try:
-                image = decode_picture(message)
-            except ValueError:
-                return
-            self._debug.publish(image_message(draw_refused(image, reason), message.header))
+            picture = _NO_PICTURE
+            if isinstance(message, Image) or not isinstance(error, PictureError):
+                with suppress(ValueError):
+                    picture = decode_picture(message)
+            self._debug.publish(image_message(draw_refused(picture, str(error)), message.header))
 
     def forget(self) -> None:
         """Broadcast no more what follows from the last answer: time went back, or it is of another map."""

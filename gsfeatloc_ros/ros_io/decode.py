@@ -13,6 +13,7 @@ import numpy as np
 
 from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.geometry import make_pose, matrix_from_quaternion
+from gsfeatloc_ros.ros_io.jpeg_png import decode, read_header
 from gsfeatloc_ros.ros_io.message_types import (
     AnyImage,
     AnyPose,
@@ -28,6 +29,10 @@ from gsfeatloc_ros.ros_io.message_types import (
 MAX_SIDE = 16384
 # Of a prior, in m^2 or rad^2; a larger one says nothing, and products of it overflow.
 _MAX_VARIANCE = 1e12
+
+
+class PictureError(ValueError):
+    """The picture of an image message cannot be used, or is of another size than its camera's."""
 
 
 @dataclass(frozen=True)
@@ -158,62 +163,39 @@ def decode_compressed_image(message: CompressedImage) -> np.ndarray:
     """Return the pixels (H, W, 3) uint8 RGB of a JPEG or PNG image, grey or in colour; an alpha channel is dropped.
 
     Raises:
-        ValueError: no JPEG or PNG of a picture, a damaged one, or the raw pattern of a Bayer filter.
+        PictureError: see picture_size; or a depth image, or the raw pattern of a Bayer filter.
     """
     encoding, _, compression = message.format.partition(";")
     if "compressedDepth" in message.format:
-        raise ValueError(f"image of format {message.format!r} is a depth image: take the topic of the pictures")
+        raise PictureError(f"image of format {message.format!r} is a depth image: take the topic of the pictures")
     if encoding.startswith("bayer") and not compression.strip().endswith(("bgr8", "rgb8")):
-        raise ValueError(f"image of format {message.format!r} has no colours yet: take the topic of the colour images")
-    picture_size(message)
-    try:
-        bgr = cv2.imdecode(np.frombuffer(message.data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    except cv2.error as error:
-        raise ValueError(f"image of format {message.format!r} cannot be decoded: {error.err}") from error
-    if bgr is None:
-        raise ValueError(
-            f"image of format {message.format!r}, {len(message.data)} bytes, is damaged, or no JPEG or PNG"
+        raise PictureError(
+            f"image of format {message.format!r} has no colours yet: take the topic of the colour images"
         )
-    return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
+    try:
+        return decode(read_header(bytes(message.data)))
+    except ValueError as error:
+        raise PictureError(f"{_named(message)} {error}") from error
 
 
 def picture_size(message: AnyImage) -> tuple[int, int]:
     """Return the width and height of the picture in an image message of either type, without decoding it.
 
     Raises:
-        ValueError: no JPEG or PNG, or a size that no camera has: a few bytes can declare gigabytes.
+        PictureError: no JPEG or PNG, a damaged one, or one that takes more than any camera's: a few bytes can hold
+            gigabytes.
     """
     if not isinstance(message, CompressedImage):
         return message.width, message.height
-    data = bytes(message.data)
-    width, height = _png_size(data) or _jpeg_size(data) or (0, 0)
-    if not width or not height:
-        raise ValueError(f"image of format {message.format!r}, {len(data)} bytes, is damaged, or no JPEG or PNG")
-    if width > MAX_SIDE or height > MAX_SIDE:
-        raise ValueError(f"image size {width}x{height} must be 1 to {MAX_SIDE} pixels a side: check the camera driver")
-    return width, height
+    try:
+        picture = read_header(bytes(message.data))
+    except ValueError as error:
+        raise PictureError(f"{_named(message)} {error}") from error
+    return picture.width, picture.height
 
 
-def _png_size(data: bytes) -> tuple[int, int] | None:
-    if not data.startswith(b"\x89PNG\r\n\x1a\n"):
-        return None
-    return int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")
-
-
-def _jpeg_size(data: bytes) -> tuple[int, int] | None:
-    """Look for the first frame header: a marker from C0 to CF, but for three of tables (ITU-T T.81, table B.1)."""
-    place = 2
-    while data.startswith(b"\xff\xd8") and place + 9 <= len(data):
-        marker = data[place + 1]
-        if marker == 0xFF:  # any number of these may come before a marker
-            place += 1
-        elif 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
-            return int.from_bytes(data[place + 7 : place + 9], "big"), int.from_bytes(
-                data[place + 5 : place + 7], "big"
-            )
-        else:
-            place += 2 + int.from_bytes(data[place + 2 : place + 4], "big")
-    return None
+def _named(message: CompressedImage) -> str:
+    return f"image of format {message.format!r}, {len(message.data)} bytes,"
 
 
 def decode_camera(message: CameraInfo, rectified: bool = False) -> Camera:

@@ -12,7 +12,14 @@ import numpy as np
 
 from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.geometry import invert, rotate_covariance, shift_covariance
-from gsfeatloc_ros.ros_io.decode import decode_camera, decode_picture, decode_pose, nanoseconds, picture_size
+from gsfeatloc_ros.ros_io.decode import (
+    PictureError,
+    decode_camera,
+    decode_picture,
+    decode_pose,
+    nanoseconds,
+    picture_size,
+)
 from gsfeatloc_ros.ros_io.growth import Growth, position_sigma
 from gsfeatloc_ros.ros_io.message_types import AnyImage
 from gsfeatloc_ros.ros_io.message_types import Odometry as OdometryMessage
@@ -210,8 +217,8 @@ class Inputs:
             prior: where it was taken; None for the newest, if there is one.
 
         Raises:
-            ValueError: the image cannot be decoded, something is missing, of another size, of the future, or in a frame
-                from which no way is known.
+            PictureError: the image cannot be decoded, or is of another size than its camera's.
+            ValueError: something is missing, of the future, or in a frame from which no way is known.
         """
         camera, newest = camera or self._camera.get(), self._prior
         if prior is None and newest.problem:
@@ -219,7 +226,7 @@ class Inputs:
         prior = prior or newest.value or (self.policy.plane() if self.policy.planar else None)
         width, height = picture_size(message)
         if (camera.width, camera.height) != (width, height):
-            raise ValueError(
+            raise PictureError(
                 f"camera_info is for {camera.width}x{camera.height} but the image is {width}x{height}: use the "
                 "camera_info of this image"
             )

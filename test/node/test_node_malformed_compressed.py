@@ -8,9 +8,10 @@ from pathlib import Path
 
 import cv2
 from hypothesis import given
-from malformed import assert_refused, compressed_images, examples, png
+from malformed import assert_refused, compressed_images, examples
 from node_harness import NodeProcess, assert_close, connected_client, running_localizer
-from sensor_msgs.msg import CompressedImage
+from picture_files import jpeg_with_hidden_size, png
+from sensor_msgs.msg import CompressedImage, Image
 
 from gsfeatloc_ros.client.messages import camera_info_of, pose_stamped
 
@@ -51,6 +52,12 @@ def test_compressed_images(room_map_file, room_camera, room_photos):
         # A few bytes that hold 200 megapixels of black.
         bomb = CompressedImage(format="png", data=png(20_000, 10_000, zlib.compress(bytes(20_001 * 10_000))))
         assert_refused(client, "image/compressed", bomb, "20000x10000")
+        # Some hundred bytes that hold 900, behind a header of the camera's size; neither is it decoded to be drawn.
+        pictures = client.listen(Image, "debug_image")
+        grey = cv2.imencode(".jpeg", photo.image[:8, :8])[1].tobytes()
+        bomb = CompressedImage(format="jpeg", data=jpeg_with_hidden_size(grey, 640, 480, 30_000))
+        assert_refused(client, "image/compressed", bomb, "is a damaged JPEG")
+        assert client.spin_until(lambda: pictures)
         # A JPEG that ends early is a picture with a grey rest to decoders.
         for part in (0.1, 0.3, 0.5, 0.7, 0.9):
             image = CompressedImage(format="jpeg", data=encoded[: int(part * len(encoded))])
@@ -60,6 +67,6 @@ def test_compressed_images(room_map_file, room_camera, room_photos):
                 assert_close(client.pose_of(image), photo.T_map_camera)
             else:
                 assert diagnostic.values["status"] in ("refused", "failed", "rejected")
-        assert peak_memory(localizer) - before < 300.0
+        assert peak_memory(localizer) - before < 200.0
         assert_good_one_is_answered()
         assert "Traceback" not in localizer.output

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-import struct
 import zlib
 from collections.abc import Callable
 from typing import Any
@@ -16,6 +15,7 @@ from geometry_msgs.msg import PoseStamped
 from hypothesis import HealthCheck, Phase, settings
 from hypothesis import strategies as st
 from node_harness import Client
+from picture_files import jpeg_with_hidden_size, png
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_msgs.msg import Header
 
@@ -231,16 +231,6 @@ def poses(draw, good: PoseStamped, message_type: type, name: str) -> tuple[Any, 
     return message, draw(st.sampled_from(kinds))()
 
 
-def png(width: int, height: int, pixels: bytes) -> bytes:
-    """A PNG that says that it is so large."""
-
-    def chunk(name: bytes, content: bytes) -> bytes:
-        return struct.pack(">I", len(content)) + name + content + struct.pack(">I", zlib.crc32(name + content))
-
-    header = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", pixels) + chunk(b"IEND", b"")
-
-
 @st.composite
 def compressed_images(draw, rgb: np.ndarray) -> tuple[CompressedImage, str]:
     """Compressed images that hold no picture of this camera, and the reason."""
@@ -251,11 +241,11 @@ def compressed_images(draw, rgb: np.ndarray) -> tuple[CompressedImage, str]:
 
     def garbage() -> str:
         image.data, image.format = draw(st.binary(max_size=1000)), draw(words.filter(lambda w: "bayer" not in w))
-        return "is damaged, or no JPEG or PNG|cannot be decoded"
+        return "is (a )?damaged|is no JPEG or PNG|has no pixels|cannot be decoded"
 
     def header_only() -> str:
         image.data = encoded[: draw(st.integers(0, 20))]
-        return "is damaged, or no JPEG or PNG|cannot be decoded"
+        return "is (a )?damaged|is no JPEG or PNG|has no pixels|cannot be decoded"
 
     def of_another_size() -> str:
         width, height = draw(st.integers(1, 64)), draw(st.integers(1, 48))
@@ -270,9 +260,14 @@ def compressed_images(draw, rgb: np.ndarray) -> tuple[CompressedImage, str]:
         image.format = "bayer_rggb8; jpeg compressed"
         return "has no colours yet"
 
+    def of_a_hidden_size() -> str:
+        jpeg = cv2.imencode(".jpeg", rgb)[1].tobytes()
+        image.data, image.format = jpeg_with_hidden_size(jpeg, 640, 480, draw(st.integers(20_000, 65_535))), "jpeg"
+        return "is a damaged JPEG"
+
     def huge() -> str:
         side = draw(st.integers(MAX_SIDE + 1, 2**31 - 1))
         image.data = png(side, side, zlib.compress(bytes(1000)))
-        return "image of format|image size"
+        return "megapixels"
 
-    return image, draw(st.sampled_from([garbage, header_only, of_another_size, depth, bayer, huge]))()
+    return image, draw(st.sampled_from([garbage, header_only, of_another_size, depth, bayer, of_a_hidden_size, huge]))()

@@ -85,7 +85,7 @@ def observed_by_the_definition(camera: Camera, slopes: np.ndarray) -> np.ndarray
 @pytest.mark.parametrize(("model", "coefficients"), [*LENSES, ("plumb_bob", [])])
 def test_skew_is_undistorted_with_the_lens(model, coefficients, skew):
     """Pixels, and pictures of a smooth pattern, which the definition says where to look for."""
-    skewed = Camera(640, 480, K + [[0, skew, 0], [0, 0, 0], [0, 0, 0]], np.array(coefficients), model)
+    skewed = Camera(640, 480, K + np.diag([skew, 0.0], k=1), np.array(coefficients), model)
     columns, rows = np.meshgrid(np.linspace(0, 639, 9), np.linspace(0, 479, 9))
     slopes = (np.column_stack([columns.ravel(), rows.ravel()]) - K[:2, 2]) / K[[0, 1], [0, 1]]
     seen_at = skewed.undistort(observed_by_the_definition(skewed, slopes))

@@ -1,0 +1,127 @@
+"""JPEG and PNG pictures of unknown origin, read so strictly that they cost no more than their size says.
+
+Decoders forgive much. libjpeg skips bytes in which another size may stand, and draws each of a million scans; libpng
+inflates comments of gigabytes. Here a JPEG must be one segment after another, and of a PNG the decoder is given no more
+than what makes its pixels: what is found here is what it finds.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+# Pixels. As many no robot's camera has; as RGB they take 150 MB.
+MAX_PIXELS = 50_000_000
+# Those of cameras and phones have about 20, with EXIF, a thumbnail and a colour profile.
+_MAX_JPEG_SEGMENTS = 200
+# The usual progressive JPEG has 10, a thumbnail in it one or 10 more. Each takes as long as the whole picture.
+_MAX_JPEG_SCANS = 64
+_JPEG_START, _JPEG_SCAN = b"\xff\xd8", 0xDA
+# Baseline, extended and progressive, with Huffman or arithmetic coding (ITU-T T.81, table B.1).
+_JPEG_FRAMES = (0xC0, 0xC1, 0xC2, 0xC9, 0xCA)
+# Tables, restart interval, applications' data, comment.
+_JPEG_OTHERS = (0xC4, 0xCC, 0xDB, 0xDD, *range(0xE0, 0xF0), 0xFE)
+_PNG_START = b"\x89PNG\r\n\x1a\n"
+# Red, green, blue and alpha of 16 bits; palette, frames of chunks and of what does not compress.
+_MAX_PNG_PIXEL_BYTES, _MAX_PNG_OVERHEAD = 9, 65536
+_PNG_CHUNKS = (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND")
+
+
+class Picture(NamedTuple):
+    """A picture that is not decoded yet.
+
+    Attributes:
+        width, height: in pixels.
+        data: that the decoder is to see.
+    """
+
+    width: int
+    height: int
+    data: bytes
+
+
+def read_header(data: bytes) -> Picture:
+    """Return what there is to decode of a JPEG or PNG, and of which size it is.
+
+    Raises:
+        ValueError: it is neither, damaged, or takes more than any camera's picture.
+    """
+    if data.startswith(_JPEG_START):
+        picture = _read_jpeg(data)
+    elif data.startswith(_PNG_START):
+        picture = _read_png(data)
+    else:
+        raise ValueError("is no JPEG or PNG")
+    width, height = picture.width, picture.height
+    if width * height == 0:
+        raise ValueError("has no pixels")
+    if width * height > MAX_PIXELS:
+        raise ValueError(f"is of size {width}x{height}, more than {MAX_PIXELS // 10**6} megapixels")
+    return picture
+
+
+def decode(picture: Picture) -> np.ndarray:
+    """Return the pixels (H, W, 3) uint8 RGB; an alpha channel is dropped, an orientation that EXIF tells ignored.
+
+    Raises:
+        ValueError: the picture is damaged.
+    """
+    try:
+        bgr = cv2.imdecode(np.frombuffer(picture.data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    except cv2.error as error:
+        raise ValueError(f"cannot be decoded: {error.err}") from error
+    if bgr is None or bgr.shape[:2] != (picture.height, picture.width):
+        raise ValueError("is damaged")
+    return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
+
+
+def _read_jpeg(data: bytes) -> Picture:
+    """Read the segments up to the first scan."""
+    scans = data.count(bytes([0xFF, _JPEG_SCAN]))
+    if scans > _MAX_JPEG_SCANS:
+        raise ValueError(f"is a JPEG of {scans} scans, at most {_MAX_JPEG_SCANS} are decoded")
+    size = None
+    for marker, segment in itertools.islice(_jpeg_segments(data), _MAX_JPEG_SEGMENTS):
+        if marker == _JPEG_SCAN and size is not None:
+            return Picture(*size, data)
+        if marker in _JPEG_FRAMES and size is None and len(segment) >= 5:
+            size = int.from_bytes(segment[3:5], "big"), int.from_bytes(segment[1:3], "big")
+        elif marker not in _JPEG_OTHERS:
+            raise ValueError(f"is a damaged JPEG, or of a kind that is not decoded (marker {marker:02X})")
+    raise ValueError("is a damaged JPEG")
+
+
+def _jpeg_segments(data: bytes) -> Iterator[tuple[int, bytes]]:
+    """Yield marker and content of each segment after the start, as long as one directly follows the other."""
+    place = len(_JPEG_START)
+    while place + 4 <= len(data) and data[place] == 0xFF:
+        if data[place + 1] == 0xFF:  # any number of these may come before a marker
+            place += 1
+            continue
+        end = place + 2 + int.from_bytes(data[place + 2 : place + 4], "big")
+        if not place + 4 <= end <= len(data):
+            return
+        yield data[place + 1], data[place + 4 : end]
+        place = end
+
+
+def _read_png(data: bytes) -> Picture:
+    """Keep the chunks that make the pixels: the first tells the size, comments and animations are left out."""
+    if data[8:16] != b"\0\0\0\rIHDR":
+        raise ValueError("is a damaged PNG")
+    kept, place = [_PNG_START], len(_PNG_START)
+    while place < len(data):
+        end = place + 12 + int.from_bytes(data[place : place + 4], "big")
+        kind = data[place + 4 : place + 8]
+        if kind in _PNG_CHUNKS:
+            kept.append(data[place:end])
+        place = end
+    picture = Picture(int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big"), b"".join(kept))
+    # What does not compress stays as large as it is; of more all is unpacked in vain, a thousand times as much.
+    if len(picture.data) > _MAX_PNG_OVERHEAD + _MAX_PNG_PIXEL_BYTES * picture.width * picture.height:
+        raise ValueError(f"is a PNG of {picture.width}x{picture.height} pixels that holds more than these")
+    return picture
