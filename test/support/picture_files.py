@@ -21,6 +21,4 @@ def jpeg_with_hidden_size(jpeg: bytes, width: int, height: int, side: int) -> by
     start = jpeg.index(b"\xff\xc0")
     frame = jpeg[start : start + 19]
     skipped = b"\0" + frame[1:5] + struct.pack(">HH", height, width) + frame[9:]
-    return (
-        jpeg[:2] + skipped + jpeg[2:start] + frame[:5] + struct.pack(">HH", side, side) + frame[9:] + jpeg[start + 19 :]
-    )
+    return jpeg[:start] + skipped + frame[:5] + struct.pack(">HH", side, side) + jpeg[start + 9 :]

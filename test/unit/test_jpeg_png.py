@@ -67,6 +67,11 @@ def test_a_size_that_is_hidden_in_bytes_that_libjpeg_skips_is_refused(side):
         read_header(data)
 
 
+def test_the_decoder_would_take_the_hidden_size():
+    data = jpeg_with_hidden_size(JPEG, 64, 48, 96)
+    assert cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR).shape == (96, 96, 3)
+
+
 @pytest.mark.usefixtures("no_decoder")
 @pytest.mark.parametrize(("width", "height"), [(30_000, 30_000), (65_500, 800), (0, 10)])
 def test_more_than_a_camera_has_is_refused_by_its_header(width, height):
