@@ -21,8 +21,9 @@ from gsfeatloc_ros.node.interfaces import ProtectionLevelMessage
 from gsfeatloc_ros.node.qos import LATCHED, RELIABLE, overridable
 from gsfeatloc_ros.node.transforms import Transforms
 from gsfeatloc_ros.ros_io.debug_picture import draw, draw_refused
-from gsfeatloc_ros.ros_io.decode import PictureError, decode_picture, nanoseconds
+from gsfeatloc_ros.ros_io.decode import PictureError, nanoseconds
 from gsfeatloc_ros.ros_io.extrinsics import Extrinsics
+from gsfeatloc_ros.ros_io.pictures import PictureReader
 from gsfeatloc_ros.ros_io.settings import Settings
 
 # Seconds between two broadcasts of the odometry's frame: as AMCL at the rate of a laser.
@@ -182,7 +183,7 @@ class Publishers:
             picture = _NO_PICTURE
             if isinstance(message, Image) or not isinstance(error, PictureError):
                 with suppress(ValueError):
-                    picture = decode_picture(message)
+                    picture = PictureReader().decode(message)
             self._debug.publish(image_message(draw_refused(picture, str(error)), message.header))
 
     def forget(self) -> None:

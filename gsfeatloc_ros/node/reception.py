@@ -15,8 +15,9 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from gsfeatloc_ros.node.attempts import Job
 from gsfeatloc_ros.node.qos import NEWEST, ODOMETRY, RELIABLE, Topic, subscribe
 from gsfeatloc_ros.node.report import Report
-from gsfeatloc_ros.ros_io.decode import nanoseconds, validate_image
+from gsfeatloc_ros.ros_io.decode import nanoseconds
 from gsfeatloc_ros.ros_io.inputs import Inputs, InputTopic
+from gsfeatloc_ros.ros_io.raw_image import validate_image
 from gsfeatloc_ros.ros_io.schedule import Schedule
 from gsfeatloc_ros.ros_io.settings import COMPRESSED, Settings
 
@@ -24,6 +25,7 @@ _TOPICS = (
     (Topic(CameraInfo, "camera_info", NEWEST), InputTopic.CAMERA_INFO),
     (Topic(PoseStamped, "prior", RELIABLE), InputTopic.PRIOR),
     (Topic(PoseWithCovarianceStamped, "prior_with_covariance", RELIABLE), InputTopic.PRIOR),
+    (Topic(Odometry, "prior_odometry", RELIABLE), InputTopic.PRIOR),
     (Topic(PoseWithCovarianceStamped, "initialpose", RELIABLE), InputTopic.INITIAL_POSE),
 )
 _ODOMETRY_TOPIC = (Topic(Odometry, "odom", ODOMETRY), InputTopic.ODOMETRY)

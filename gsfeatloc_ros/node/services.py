@@ -16,9 +16,10 @@ from gsfeatloc_ros.common.stage_clock import Interrupted
 from gsfeatloc_ros.node.attempts import Attempts, Job, JobResult
 from gsfeatloc_ros.node.interfaces import LocalizeImage
 from gsfeatloc_ros.node.session import Session
-from gsfeatloc_ros.ros_io.decode import decode_camera, validate_image
+from gsfeatloc_ros.ros_io.calibration import decode_camera
 from gsfeatloc_ros.ros_io.outcome import Outcome, OutcomeStatus
 from gsfeatloc_ros.ros_io.prior import PriorSource, decode_prior
+from gsfeatloc_ros.ros_io.raw_image import validate_image
 
 _UNCONFIGURED = "the node is not configured: configure and activate it (ros2 lifecycle set ... configure)"
 _INACTIVE = "the node is not active: activate it (ros2 lifecycle set ... activate)"

@@ -19,6 +19,7 @@ from gsfeatloc_ros.node.standing import StandingPublisher
 from gsfeatloc_ros.node.transforms import Transforms
 from gsfeatloc_ros.ros_io.follower import Follower
 from gsfeatloc_ros.ros_io.inputs import Inputs
+from gsfeatloc_ros.ros_io.pictures import PictureReader
 from gsfeatloc_ros.ros_io.settings import CONTINUOUS, ON_REQUEST, Settings
 from gsfeatloc_ros.ros_io.state import LocalizationState, State
 
@@ -67,6 +68,7 @@ class Session:
             transforms.lookup,
             settings.image.rectified,
             f"no camera_info yet: publish sensor_msgs/CameraInfo on {node.resolve_topic_name('camera_info')}",
+            PictureReader(settings.image.bits, reporter.info),
         )
         self._inputs, self._follower = inputs, Follower(inputs, state, settings.node.track)
         self._pose_file = PoseFile(settings.state.path, settings.map, reporter)

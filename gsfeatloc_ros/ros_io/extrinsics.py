@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsfeatloc_ros.common.geometry import flattened, invert, shift_covariance
-from gsfeatloc_ros.ros_io.decode import nanoseconds
+from gsfeatloc_ros.ros_io.decode import frame_name, nanoseconds
 from gsfeatloc_ros.ros_io.inputs import Lookup
 from gsfeatloc_ros.ros_io.message_types import Header
 
@@ -68,7 +68,7 @@ class AnswerFrames:
         """
 
         def T_camera(frame: str) -> np.ndarray:
-            return lookup(header.frame_id, frame, nanoseconds(header.stamp))
+            return lookup(frame_name(header.frame_id), frame, nanoseconds(header.stamp))
 
         broadcast = self.odom and shared
         return Extrinsics(

@@ -8,7 +8,7 @@ import numpy as np
 
 from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.localize.options import MAX_SEED, LocalizerOptions
-from gsfeatloc_ros.ros_io.decode import nanoseconds
+from gsfeatloc_ros.ros_io.decode import frame_name, nanoseconds
 from gsfeatloc_ros.ros_io.inputs import Inputs, LocalizerInput
 from gsfeatloc_ros.ros_io.message_types import AnyImage, Header
 from gsfeatloc_ros.ros_io.prior import Prior, PriorSource
@@ -53,7 +53,7 @@ class Follower:
             header: of the image.
             T_map_camera: (4, 4) the answer; None for none.
         """
-        self._camera_frame = header.frame_id
+        self._camera_frame = frame_name(header.frame_id)
         attempt = Attempt(
             query.source, query.T_map_camera_prior, query.prior_covariance, T_map_camera, self._confirmable(header)
         )
@@ -73,7 +73,7 @@ class Follower:
         newest, stamp = query.newest_prior, nanoseconds(header.stamp)
         if newest is not None and newest.source.own and newest.stamp > stamp:
             return
-        if self._camera_frame not in (None, header.frame_id):
+        if self._camera_frame not in (None, frame_name(header.frame_id)):
             return
         unconfirmed = is_unattested(query.source) and self._confirmable(header)
         self._go_on(query, header, T_map_camera, PriorSource.UNCONFIRMED if unconfirmed else PriorSource.LAST_ANSWER)
@@ -97,5 +97,5 @@ class Follower:
     def _go_on(self, query: LocalizerInput, header: Header, T_map_camera: np.ndarray, source: PriorSource) -> None:
         if self._track:
             frame = self._inputs.policy.map_frame
-            answer = Prior(source, nanoseconds(header.stamp), frame, False, T_map_camera, None)
+            answer = Prior(source, nanoseconds(header.stamp), frame, "", T_map_camera, None)
             self._inputs.take_answer(answer, query)

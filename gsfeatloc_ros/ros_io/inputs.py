@@ -12,19 +12,14 @@ import numpy as np
 
 from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.geometry import invert, rotate_covariance, shift_covariance
-from gsfeatloc_ros.ros_io.decode import (
-    PictureError,
-    decode_camera,
-    decode_picture,
-    decode_pose,
-    nanoseconds,
-    picture_size,
-)
+from gsfeatloc_ros.ros_io.calibration import decode_camera
+from gsfeatloc_ros.ros_io.decode import PictureError, decode_pose, frame_name, nanoseconds, picture_size
 from gsfeatloc_ros.ros_io.growth import Growth, position_sigma
 from gsfeatloc_ros.ros_io.message_types import AnyImage
 from gsfeatloc_ros.ros_io.message_types import Odometry as OdometryMessage
 from gsfeatloc_ros.ros_io.odometry import OdometryBuffer
-from gsfeatloc_ros.ros_io.prior import Prior, PriorPolicy, PriorSource, decode_prior
+from gsfeatloc_ros.ros_io.pictures import PictureReader
+from gsfeatloc_ros.ros_io.prior import Prior, PriorPolicy, PriorSource, body_of, decode_prior
 
 T = TypeVar("T")
 
@@ -103,22 +98,32 @@ class Inputs:
         lookup: of the robot's frames.
         rectified: whether images are.
         no_camera: what to say while there is no camera_info.
+        pictures: decodes the images.
 
     Attributes:
         policy: what priors are worth; may be replaced later.
         line_delay: seconds from a row of images to the next; 0 for a global shutter. May be replaced later.
     """
 
-    def __init__(self, policy: PriorPolicy, lookup: Lookup, rectified: bool, no_camera: str) -> None:
+    def __init__(
+        self,
+        policy: PriorPolicy,
+        lookup: Lookup,
+        rectified: bool,
+        no_camera: str,
+        pictures: PictureReader | None = None,
+    ) -> None:
         self.policy = policy
         self.line_delay = 0.0
         self._lookup = lookup
         self._rectified = rectified
+        self._pictures = pictures or PictureReader()
         self._camera: _Newest[Camera] = _Newest(problem=no_camera)
         self._prior: _Newest[Prior] = _NOTHING
         self._prior_lock = Lock()
         self._odometry = self._no_odometry()
-        self._odometry_frame = ""
+        # Of the odometry itself, and of the body whose poses it gives.
+        self._odometry_frames = ("", "")
 
     @property
     def missing(self) -> list[str]:
@@ -130,7 +135,7 @@ class Inputs:
 
         Args:
             topic: that it came on.
-            message: CameraInfo, PoseStamped or PoseWithCovarianceStamped, or Odometry.
+            message: CameraInfo; of priors PoseStamped, PoseWithCovarianceStamped or Odometry; or Odometry.
 
         Raises:
             ValueError: the message cannot be used; the error says why.
@@ -230,10 +235,10 @@ class Inputs:
                 f"camera_info is for {camera.width}x{camera.height} but the image is {width}x{height}: use the "
                 "camera_info of this image"
             )
-        stamp, frame = nanoseconds(message.header.stamp), message.header.frame_id
+        stamp, frame = nanoseconds(message.header.stamp), frame_name(message.header.frame_id)
         pose, covariance = (None, None) if prior is None else self._at(prior, stamp, frame)
         camera = replace(camera, readout=self._readout(stamp, frame, height))
-        return LocalizerInput(decode_picture(message), camera, pose, covariance, prior, newest.value)
+        return LocalizerInput(self._pictures.decode(message), camera, pose, covariance, prior, newest.value)
 
     def _set_prior(self, newest: _Newest[Prior]) -> None:
         with self._prior_lock:
@@ -244,17 +249,22 @@ class Inputs:
 
     def _take_odometry(self, message: OdometryMessage) -> None:
         pose = decode_pose(message, InputTopic.ODOMETRY.value)
-        if message.child_frame_id != self._odometry_frame:
+        frames = (frame_name(message.header.frame_id), body_of(message, InputTopic.ODOMETRY.value))
+        if frames != self._odometry_frames:
             self._odometry = self._no_odometry()
-            self._odometry_frame = message.child_frame_id
+            self._odometry_frames = frames
         self._odometry.add(nanoseconds(message.header.stamp), pose)
+
+    @property
+    def _odometry_body(self) -> str:
+        return self._odometry_frames[1]
 
     def _readout(self, stamp: int, camera_frame: str, rows: int) -> np.ndarray | None:
         """Return how the camera moved (6,) while it read the rows of an image; None where that is not known."""
         velocity = self._odometry.velocity(stamp) if stamp and self.line_delay else None
         if velocity is None:
             return None
-        T_body_camera = self._lookup(self._odometry_frame, camera_frame, stamp)
+        T_body_camera = self._transform(self._odometry_body, camera_frame, stamp)
         linear, angular = velocity[:3] + np.cross(velocity[3:], T_body_camera[:3, 3]), velocity[3:]
         in_camera = np.concatenate([linear @ T_body_camera[:3, :3], angular @ T_body_camera[:3, :3]])
         return rows * self.line_delay * in_camera
@@ -264,17 +274,17 @@ class Inputs:
         policy, pose, covariance = self.policy, prior.pose, prior.covariance
         if prior.frame != policy.map_frame:
             try:
-                T_map_frame = self._lookup(policy.map_frame, prior.frame, prior.stamp)
+                T_map_frame = self._transform(policy.map_frame, prior.frame, prior.stamp)
             except ValueError as error:
                 raise ValueError(
                     f"{prior.source.value} is in frame {prior.frame!r} but the map is in {policy.map_frame!r}: {error}"
                 ) from error
             pose = T_map_frame @ pose
             covariance = None if covariance is None else rotate_covariance(covariance, T_map_frame[:3, :3])
-        if prior.of_base:
-            base = pose
-            pose = base @ self._lookup(policy.base_frame, camera_frame, stamp)
-            covariance = None if covariance is None else shift_covariance(covariance, pose[:3, 3] - base[:3, 3])
+        if prior.body:
+            body = pose
+            pose = body @ self._transform(prior.body, camera_frame, stamp)
+            covariance = None if covariance is None else shift_covariance(covariance, pose[:3, 3] - body[:3, 3])
         if not stamp or not prior.stamp:
             return pose, covariance
         age = 1e-9 * (stamp - prior.stamp)
@@ -282,7 +292,7 @@ class Inputs:
         motion = self._odometry.motion(prior.stamp, stamp) if carried else None
         travelled = self._odometry.travelled(prior.stamp, stamp) if carried else None
         if motion is not None and travelled is not None:
-            T_body_camera = self._lookup(self._odometry_frame, camera_frame, stamp)
+            T_body_camera = self._transform(self._odometry_body, camera_frame, stamp)
             pose = pose @ invert(T_body_camera) @ motion @ T_body_camera
             return pose, self._grown(covariance, policy.growth.by_odometry(travelled))
         if not prior.source.own and policy.max_age and -age > policy.max_age:
@@ -293,6 +303,9 @@ class Inputs:
         if prior.source.own or (policy.max_age and age > policy.max_age):
             covariance = self._grown(covariance, policy.growth.by_time(age))
         return pose, covariance
+
+    def _transform(self, target: str, source: str, stamp: int) -> np.ndarray:
+        return np.eye(4) if target == source else self._lookup(target, source, stamp)
 
     def _grown(self, covariance: np.ndarray | None, growth: Growth) -> np.ndarray:
         known = self.policy.default_covariance() if covariance is None else covariance

@@ -58,6 +58,7 @@ class RegionOfInterest(Protocol):
     y_offset: int
     height: int
     width: int
+    do_rectify: bool
 
 
 class CameraInfo(Protocol):
@@ -121,6 +122,7 @@ class PoseWithCovarianceStamped(Protocol):
     pose: PoseWithCovariance
 
 
+@runtime_checkable
 class Odometry(Protocol):
     """nav_msgs/Odometry."""
 

@@ -8,9 +8,9 @@ from enum import Enum
 import numpy as np
 
 from gsfeatloc_ros.common.geometry import isotropic_covariance
-from gsfeatloc_ros.ros_io.decode import decode_covariance, decode_pose, nanoseconds
+from gsfeatloc_ros.ros_io.decode import decode_covariance, decode_pose, frame_name, nanoseconds
 from gsfeatloc_ros.ros_io.growth import GrowthOptions
-from gsfeatloc_ros.ros_io.message_types import AnyPose
+from gsfeatloc_ros.ros_io.message_types import AnyPose, Odometry
 
 # Variance of a coordinate of which nothing is known, in square map units or radians.
 _UNKNOWN = 1e6
@@ -72,12 +72,12 @@ class PriorPolicy:
         """Return the prior of a base that stands somewhere on the plane z = 0 of the map, upright."""
         variances = self.default_covariance().diagonal() * _SHARE_OFF_PLANE**2
         variances[[0, 1, 5]] = _UNKNOWN
-        return Prior(PriorSource.PLANE, 0, self.map_frame, True, np.eye(4), np.diag(variances))
+        return Prior(PriorSource.PLANE, 0, self.map_frame, self.base_frame, np.eye(4), np.diag(variances))
 
     def saved(self, T_map_camera: np.ndarray, sigma: float) -> Prior:
         """Return the prior that a pose (4, 4) of a run before is; the robot may be `sigma` map units away from it."""
         covariance = isotropic_covariance(sigma, _SAVED_ROTATION)
-        return Prior(PriorSource.SAVED, 0, self.map_frame, False, T_map_camera, covariance)
+        return Prior(PriorSource.SAVED, 0, self.map_frame, "", T_map_camera, covariance)
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +88,7 @@ class Prior:
         source: where it comes from.
         stamp: in nanoseconds; 0 for none: then it holds at any time.
         frame: that it is given in.
-        of_base: whether it is the pose of the base; otherwise of the camera's optical frame.
+        body: frame of the body whose pose it is; empty for the camera's optical frame.
         pose: (4, 4) in `frame`.
         covariance: (6, 6) about the axes of `frame` in ROS order, or None where it is not known.
     """
@@ -96,25 +96,37 @@ class Prior:
     source: PriorSource
     stamp: int
     frame: str
-    of_base: bool
+    body: str
     pose: np.ndarray
     covariance: np.ndarray | None
 
 
-def decode_prior(message: AnyPose, source: PriorSource, policy: PriorPolicy) -> Prior:
-    """Decode a prior; RViz's initial pose is of the base in any case, others as the policy says.
+def decode_prior(message: AnyPose | Odometry, source: PriorSource, policy: PriorPolicy) -> Prior:
+    """Decode a prior.
+
+    Odometry says what it is the pose of; RViz's initial pose is of the base, others as the policy says.
 
     Raises:
         ValueError: the message cannot be used; the error says why.
     """
     name = source.value
-    if not message.header.frame_id:
+    frame = frame_name(message.header.frame_id)
+    if not frame:
         raise ValueError(f"{name} is in frame '': name the frame in its header, the map's or one that tf knows")
-    return Prior(
-        source,
-        nanoseconds(message.header.stamp),
-        message.header.frame_id,
-        policy.of_base or source is PriorSource.INITIAL_POSE,
-        decode_pose(message, name),
-        decode_covariance(message, name),
-    )
+    if isinstance(message, Odometry):
+        body = body_of(message, name)
+    else:
+        body = policy.base_frame if policy.of_base or source is PriorSource.INITIAL_POSE else ""
+    stamp = nanoseconds(message.header.stamp)
+    return Prior(source, stamp, frame, body, decode_pose(message, name), decode_covariance(message, name))
+
+
+def body_of(message: Odometry, name: str) -> str:
+    """Return the frame of the body whose poses odometry gives; raise ValueError where it does not say."""
+    body = frame_name(message.child_frame_id)
+    if not body:
+        raise ValueError(
+            f"{name} has no child_frame_id, so that nobody knows of what it is the pose: have its publisher name "
+            "the frame, base_link say"
+        )
+    return body

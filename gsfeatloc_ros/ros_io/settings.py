@@ -98,6 +98,12 @@ class ImageSettings:
         (0.0, 0.001),
         live=True,
     )
+    bits: int = parameter(
+        0,
+        "Bits that the values of 16-bit images have; 0 for what the largest needs. 16UC1 (depth, or infrared) is taken "
+        "as a picture only where this is set.",
+        (0, 16),
+    )
     timeout: float = parameter(
         5.0, "Seconds without an image after which there is none for requests.", (0.1, 3600.0), live=True
     )

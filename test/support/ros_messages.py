@@ -39,7 +39,7 @@ def odometry(seconds: float, pose: np.ndarray, child: str = "base_link") -> Mess
 
 
 def camera_info(width: int = 8, height: int = 6) -> Message:
-    roi = Message(x_offset=0, y_offset=0, width=0, height=0)
+    roi = Message(x_offset=0, y_offset=0, width=0, height=0, do_rectify=False)
     k = [10.0, 0, 4, 0, 10, 3, 0, 0, 1]
     return Message(
         width=width, height=height, k=k, d=[], p=[0.0] * 12, distortion_model="", roi=roi, binning_x=0, binning_y=0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import struct
 
 import numpy as np
@@ -15,20 +16,30 @@ from std_msgs.msg import Header
 
 from gsfeatloc_ros.common.geometry import make_pose, so3_exp
 from gsfeatloc_ros.node.encode import image_message, pose_message
-from gsfeatloc_ros.ros_io.decode import ENCODINGS, decode_camera, decode_image, decode_pose, validate_image
+from gsfeatloc_ros.ros_io.calibration import decode_camera
+from gsfeatloc_ros.ros_io.decode import decode_pose
+from gsfeatloc_ros.ros_io.raw_image import ENCODINGS, decode_image, validate_image
 
 COLOUR_ORDER = {"rgb8": "rgb", "bgr8": "bgr", "rgba8": "rgba", "bgra8": "bgra", "8UC3": "bgr", "8UC4": "bgra"}
-DEEP_COLOUR_ORDER = {"rgb16": "rgb", "bgr16": "bgr", "rgba16": "rgba", "bgra16": "bgra"}
-PLANAR_ORDER = {"nv21": "vu", "nv24": "uv"}
+DEEP_COLOUR_ORDER = {
+    "rgb16": "rgb",
+    "bgr16": "bgr",
+    "rgba16": "rgba",
+    "bgra16": "bgra",
+    "16UC3": "bgr",
+    "16UC4": "bgra",
+}
+PLANAR_ORDER = {"nv12": "uv", "nv21": "vu", "nv24": "uv"}
 YUV_ORDER = {"yuv422": "uyvy", "uyvy": "uyvy", "yuv422_yuy2": "yuyv", "yuyv": "yuyv"}
 BAYER = sorted(name for name in ENCODINGS if name.startswith("bayer"))
-MONO = ("mono8", "mono16", "8UC1")
+MONO = ("mono8", "mono16", "8UC1", "16UC1")
+DEEP = re.compile("16$|^16UC")
 any_double = st.floats(allow_nan=True, allow_infinity=True)
 
 
 def make_image(encoding: str, samples: np.ndarray, padding: int, bigendian: bool) -> Image:
     """Image of samples (H, samples per row), every row followed by `padding` bytes of rubbish."""
-    code = (">" if bigendian else "<") + ("H" if encoding.endswith("16") else "B")
+    code = (">" if bigendian else "<") + ("H" if DEEP.search(encoding) else "B")
     rows = [b"".join(struct.pack(code, int(value)) for value in row) + b"\xa5" * padding for row in samples]
     message = Image(encoding=encoding, height=len(rows), step=len(rows[0]), is_bigendian=int(bigendian))
     message.data = b"".join(rows)
@@ -43,7 +54,7 @@ def images(draw, encodings):
     multiple = ENCODINGS[encoding].multiple
     width = draw(st.integers(smallest[0], 9)) // multiple[0] * multiple[0]
     height = draw(st.integers(smallest[1], 7))
-    dtype = np.uint16 if encoding.endswith("16") else np.uint8
+    dtype = np.uint16 if DEEP.search(encoding) else np.uint8
     samples = draw(npst.arrays(dtype, (height, width * ENCODINGS[encoding].channels)))
     message = make_image(encoding, samples, draw(st.integers(0, 5)), draw(st.booleans()))
     message.width = width
@@ -82,7 +93,7 @@ def test_chroma_that_lies_below_the_brightness_follows_bt601(encoding, size, pad
     luma = data.draw(npst.arrays(np.uint8, (height, width), elements=st.integers(16, 255)))
     # One pair of chroma values for each four pixels; nv24 has them for each pixel.
     pairs = data.draw(npst.arrays(np.uint8, (height // 2, width // 2, 2)))
-    chroma = pairs if encoding == "nv21" else pairs.repeat(2, 0).repeat(2, 1)
+    chroma = pairs if encoding != "nv24" else pairs.repeat(2, 0).repeat(2, 1)
     message = make_image(encoding, np.vstack([luma, chroma.reshape(-1, width)]), padding, bigendian=False)
     message.width, message.height = width, height
     rgb = decode_image(message)
@@ -98,7 +109,7 @@ def test_chroma_that_lies_below_the_brightness_follows_bt601(encoding, size, pad
 
 
 def test_every_encoding_that_is_of_a_picture_is_known():
-    # sensor_msgs/image_encodings.hpp of Jazzy, but for depth, flow and the like: 16UC1, 32FC1, 8UC2 ...
+    # sensor_msgs/image_encodings.hpp of Jazzy, but for flow, signed numbers and the like: 8UC2, 16SC1, 32FC3 ...
     assert set(ENCODINGS) == {*COLOUR_ORDER, *DEEP_COLOUR_ORDER, *MONO, *YUV_ORDER, *PLANAR_ORDER, *BAYER}
     assert len(BAYER) == 8
 
@@ -106,7 +117,7 @@ def test_every_encoding_that_is_of_a_picture_is_known():
 @given(images(MONO))
 def test_grey_fills_all_channels_and_16_bits_become_8(case):
     message, samples = case
-    grey = samples if message.encoding != "mono16" else [[round(int(v) / 257) for v in row] for row in samples]
+    grey = samples if not DEEP.search(message.encoding) else [[round(int(v) / 257) for v in row] for row in samples]
     rgb = decode_image(message)
     for channel in range(3):
         assert np.array_equal(rgb[..., channel], grey)
@@ -177,6 +188,7 @@ def test_data_longer_than_the_image_is_taken():
     [
         ({"encoding": "jpeg"}, "encoding 'jpeg' is not supported"),
         ({"encoding": ""}, "encoding '' is not supported"),
+        ({"encoding": "32FC1"}, "encoding '32FC1' is that of depth images"),
         ({"width": 0}, "size 0x4"),
         ({"height": 0}, "size 4x0"),
         ({"width": 2**32 - 1, "height": 2**32 - 1, "step": 2**32 - 1}, "size 4294967295x4294967295"),
@@ -249,11 +261,11 @@ def test_camera_models_of_camera_info(model, count):
     ("changes", "says"),
     [
         ({"k": [0.0] * 9}, "not calibrated"),
-        ({"width": 0}, "size 0x48"),
+        ({"width": 0}, "size is 0x48: have the driver fill in the size"),
         ({"k": [float("nan")] * 9}, "finite"),
         ({"d": [float("inf")] * 5}, "finite"),
         ({"distortion_model": "thin_prism"}, "'thin_prism' is not one of"),
-        ({"d": [0.1] * 3}, "takes .* coefficients"),
+        ({"d": [0.1] * 15}, "takes at most 14 coefficients, got 15"),
     ],
 )
 def test_camera_info_that_cannot_be_used_is_refused_with_the_reason(changes, says):

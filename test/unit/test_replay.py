@@ -437,6 +437,9 @@ def test_covariance_of_a_prior():
     assert np.array_equal(decode_covariance(pose_with_covariance(0, np.eye(4), covariance), "prior"), covariance)
     assert decode_covariance(pose_with_covariance(0, np.eye(4), np.zeros((6, 6))), "prior") is None
     assert decode_covariance(pose_stamped(0, np.eye(4)), "prior") is None
-    for wrong in (np.nan, -1.0):
+    for unknown in (np.nan, -1.0):
+        message = pose_with_covariance(0, np.eye(4), np.diag([unknown, 1, 1, 1, 1, 1.0]))
+        assert decode_covariance(message, "prior") is None
+    for wrong in (np.inf, -2.0):
         with pytest.raises(ValueError, match="finite, and no variance negative"):
             decode_covariance(pose_with_covariance(0, np.eye(4), np.diag([wrong, 1, 1, 1, 1, 1.0])), "prior")
