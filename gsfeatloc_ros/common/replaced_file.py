@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
+import glob
 import os
+import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
+
+from gsfeatloc_ros.common.safe_files import open_own
+
+_SUFFIX = ".tmp"
 
 
 @contextmanager
@@ -15,7 +22,7 @@ def replaced_file(path: Path) -> Iterator[BinaryIO]:
     """Open what is to take the place of a file, or to be it.
 
     Whoever reads `path` finds the old file or the whole new one, after a power cut as well. It is put in place at the
-    end of the block, and not at all if that is left by an exception.
+    end of the block, and not at all if that is left by an exception. Others can read it, not write to it.
 
     Args:
         path: of the file; its folder must be there.
@@ -23,15 +30,26 @@ def replaced_file(path: Path) -> Iterator[BinaryIO]:
     Raises:
         OSError: it cannot be written.
     """
-    # Beside it: a file is only renamed within a file system.
-    temporary = path.with_name(f"{path.name}.{os.getpid()}")
+    _remove_leftovers(path)
+    # Beside it: a file is only renamed within a file system. Nobody can have put a link there under a name of chance.
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}{_SUFFIX}")
+    descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
     try:
-        with temporary.open("wb") as stream:
+        with os.fdopen(descriptor, "wb") as stream:
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
             yield stream
             stream.flush()
             os.fsync(stream.fileno())
-        os.replace(temporary, path)
+            os.replace(temporary, path)
     except BaseException:
         with contextlib.suppress(OSError):
             temporary.unlink()
         raise
+
+
+def _remove_leftovers(path: Path) -> None:
+    """Remove what processes left that were killed while they wrote `path`: those that write hold a lock."""
+    for leftover in path.parent.glob(f".{glob.escape(path.name)}.*{_SUFFIX}"):
+        with contextlib.suppress(OSError), open_own(leftover) as stream:
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            leftover.unlink()

@@ -13,6 +13,7 @@ import numpy as np
 
 from gsfeatloc_ros.common.kernel_cache import can_write, user_cache_folder
 from gsfeatloc_ros.common.replaced_file import replaced_file
+from gsfeatloc_ros.common.safe_files import UntrustedError, open_own
 from gsfeatloc_ros.index.view_index import CODE_BYTES, ViewIndex
 
 SUFFIX = ".gsfeatloc-index"
@@ -88,13 +89,15 @@ def load_index(path: Path, key: dict[str, Any] | None = None) -> ViewIndex | Non
 
     Raises:
         ValueError: it is no index or damaged.
-        OSError: it cannot be read.
+        OSError: it cannot be read, or another user may have written it.
     """
     try:
-        with path.open("rb") as stream:
+        with open_own(path) as stream:
             return _read(stream, path, key)
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         return None
+    except UntrustedError as error:
+        raise UntrustedError(f"{path}: {error}, and it is made again") from None
 
 
 def _read(stream: BinaryIO, path: Path, key: dict[str, Any] | None) -> ViewIndex | None:

@@ -17,21 +17,24 @@ import numpy as np
 
 from gsfeatloc_ros.common.kernel_cache import hash_of_sources
 from gsfeatloc_ros.common.replaced_file import replaced_file
+from gsfeatloc_ros.common.safe_files import open_own, open_regular
 from gsfeatloc_ros.maps import MapError, Similarity, load_map
-from gsfeatloc_ros.render.prepare import PreparedMap, prepare
+from gsfeatloc_ros.maps.gaussian_map import SH_COEFFICIENTS
+from gsfeatloc_ros.render.prepare import CHUNK, LOG2_OPACITY, MEAN_X, MEAN_Z, ROWS, PreparedMap, prepare
 
 SUFFIX = ".gsfeatloc-cache"
 
 _log = logging.getLogger(__name__)
 
-# A cache is this line, the CRC-32 of all that follows the next number (4 bytes), the length of the header (4 bytes,
-# both little-endian), the header (JSON) and the arrays one after another.
-_MAGIC = b"gsfeatloc_ros prepared map\n"
-_ARRAYS = ("gaussians", "sh", "low", "high")
+# Only what no other user can have written is read: the checksum tells damage, no more. A cache is this line, the CRC-32
+# of all that follows the next number (4 bytes), the header's length (4 bytes, both little-endian), the header (JSON) and
+# the arrays one after another.
+_MAGIC = b"gsfeatloc_ros prepared map 2\n"
+# Gaussians of a map of 1 TB; more chunks are a lie.
+_MAX_CHUNKS = 2**32 // CHUNK
 _MAX_HEADER_BYTES = 64 * 1024
-# Of a map's content so many blocks are hashed, spread evenly. Size and time alone may be those of another map: images
-# of containers and archives set all times to the same. To hash it all takes reading it all, which the cache is to save.
-_SAMPLES, _SAMPLE_BYTES = 64, 4096
+# All ones in a half: infinite, or no number.
+_HALF_EXPONENT = np.uint16(0x7C00)
 # An unbundled .sog is the files of these kinds in its folder.
 _SOG_SUFFIXES = (".json", ".webp")
 
@@ -57,7 +60,7 @@ def load_prepared(
     path = Path(path)
     absolute = Path(os.path.abspath(path))
     cache_path = absolute.with_name(absolute.name + SUFFIX) if cache_path is None else Path(cache_path)
-    origin = {"code": _code(), "files": [_identity(file) for file in _map_files(absolute)]}
+    origin = {"code": _code(), "map": [_content(file) for file in _map_files(absolute)]}
     prepared = _read_if_usable(cache_path, origin)
     if prepared is None:
         prepared = prepare(load_map(path))
@@ -68,7 +71,7 @@ def load_prepared(
 def _read_if_usable(path: Path, origin: dict[str, Any]) -> PreparedMap | None:
     """Return the map in a cache; None where there is no cache of a map of this `origin`."""
     try:
-        with path.open("rb") as stream:
+        with open_own(path) as stream:
             return _read(stream, origin)
     except FileNotFoundError:
         return None
@@ -79,7 +82,7 @@ def _read_if_usable(path: Path, origin: dict[str, Any]) -> PreparedMap | None:
 
 def _read(stream: BinaryIO, origin: dict[str, Any]) -> PreparedMap | None:
     if stream.read(len(_MAGIC)) != _MAGIC:
-        raise _CacheError("is no prepared map")
+        raise _CacheError("is no prepared map of this version")
     checksum, length = (int.from_bytes(stream.read(4), "little") for _ in range(2))
     if length > _MAX_HEADER_BYTES:
         raise _CacheError("is damaged")
@@ -88,19 +91,44 @@ def _read(stream: BinaryIO, origin: dict[str, Any]) -> PreparedMap | None:
         header = json.loads(encoded)
         if header["origin"] != origin:
             return None
-        layout = {name: (np.dtype(dtype), shape) for name, (dtype, shape) in header["arrays"].items()}
-        size = sum(dtype.itemsize * math.prod(shape) for dtype, shape in layout.values())
-        if size != os.fstat(stream.fileno()).st_size - stream.tell():
-            raise _CacheError("is truncated")
-        arrays = {
-            name: np.fromfile(stream, dtype, math.prod(shape)).reshape(shape) for name, (dtype, shape) in layout.items()
-        }
-        if _checksum(encoded, arrays) != checksum:
-            raise _CacheError("is damaged")
-        gaussians, sh, low, high = (arrays[name] for name in _ARRAYS)
-        return PreparedMap(gaussians, sh, low, high, antialiased=header["antialiased"])
-    except (KeyError, TypeError, AttributeError, ValueError, RecursionError) as error:
+        chunks, coefficients, antialiased = (header[name] for name in ("chunks", "sh_coefficients", "antialiased"))
+    except (KeyError, TypeError, ValueError, RecursionError) as error:
         raise _CacheError("is damaged") from error
+    known = type(chunks) is int and type(coefficients) is int and type(antialiased) is bool
+    if not known or not 0 <= chunks <= _MAX_CHUNKS or coefficients not in SH_COEFFICIENTS:
+        raise _CacheError("is damaged")
+    layout = _layout(chunks, coefficients)
+    size = sum(np.dtype(dtype).itemsize * math.prod(shape) for dtype, shape in layout.values())
+    if size != os.fstat(stream.fileno()).st_size - stream.tell():
+        raise _CacheError("is truncated")
+    arrays = {
+        name: np.fromfile(stream, dtype, math.prod(shape)).reshape(shape) for name, (dtype, shape) in layout.items()
+    }
+    prepared = PreparedMap(arrays["gaussians"], arrays["sh"], arrays["low"], arrays["high"], antialiased=antialiased)
+    if _checksum(encoded, arrays) != checksum or not _is_possible(prepared):
+        raise _CacheError("is damaged")
+    return prepared
+
+
+def _layout(chunks: int, coefficients: int) -> dict[str, tuple[str, tuple[int, ...]]]:
+    """Return type and shape of each array of a prepared map, in the order of the file."""
+    return {
+        "gaussians": ("<f4", (chunks, ROWS, CHUNK)),
+        "sh": ("<f2", (chunks, 3 * coefficients, CHUNK)),
+        "low": ("<f4", (chunks, 3)),
+        "high": ("<f4", (chunks, 3)),
+    }
+
+
+def _is_possible(prepared: PreparedMap) -> bool:
+    """Return whether all values are such as `prepare` makes of a map: of finite Gaussians, none more than opaque."""
+    opacity = prepared.gaussians[:, LOG2_OPACITY]
+    return bool(
+        np.isfinite(prepared.gaussians[:, MEAN_X : MEAN_Z + 1]).all()
+        and (opacity <= 0).all()
+        # By their bits, which takes a third of the time of isfinite.
+        and ((prepared.sh.view(np.uint16) & _HALF_EXPONENT) != _HALF_EXPONENT).all()
+    )
 
 
 def _write_if_possible(path: Path, prepared: PreparedMap, origin: dict[str, Any]) -> None:
@@ -113,9 +141,9 @@ def _write_if_possible(path: Path, prepared: PreparedMap, origin: dict[str, Any]
 
 
 def _write(stream: BinaryIO, prepared: PreparedMap, origin: dict[str, Any]) -> None:
-    arrays: dict[str, np.ndarray] = {name: getattr(prepared, name) for name in _ARRAYS}
-    layout = {name: (array.dtype.str, array.shape) for name, array in arrays.items()}
-    encoded = json.dumps({"origin": origin, "antialiased": prepared.antialiased, "arrays": layout}).encode()
+    about = {"chunks": len(prepared.gaussians), "sh_coefficients": prepared.sh_coefficients}
+    arrays: dict[str, np.ndarray] = {name: getattr(prepared, name) for name in _layout(0, 1)}
+    encoded = json.dumps({"origin": origin, "antialiased": prepared.antialiased, **about}).encode()
     stream.write(_MAGIC)
     for number in (_checksum(encoded, arrays), len(encoded)):
         stream.write(number.to_bytes(4, "little"))
@@ -132,7 +160,7 @@ def _checksum(header: bytes, arrays: dict[str, np.ndarray]) -> int:
 
 
 def map_content(path: str | Path) -> list[Any]:
-    """Return what tells the content of a map from that of others: size and a hash of a sample of each of its files.
+    """Return what tells the content of a map from that of others: size and SHA-256 of each of its files.
 
     It is the same for a copy under another name.
 
@@ -142,7 +170,7 @@ def map_content(path: str | Path) -> list[Any]:
     files = _map_files(Path(os.path.abspath(path)))
     if not files:
         raise MapError(f"{path}: cannot be read: there is no such map")
-    return [[identity[1], identity[3]] for identity in map(_identity, files)]
+    return [_content(file) for file in files]
 
 
 def _map_files(path: Path) -> list[Path]:
@@ -155,23 +183,17 @@ def _map_files(path: Path) -> list[Path]:
     return [file for file in files if file.is_file()]
 
 
-def _identity(file: Path) -> list[Any]:
-    """Return name, size in bytes, time of the last change and a hash of a sample of the content.
+def _content(file: Path) -> list[Any]:
+    """Return the size in bytes and the SHA-256 of a file: 0.15 s for a map of a million Gaussians, 236 MB.
 
     Raises:
         MapError: the file cannot be read.
     """
-    digest = hashlib.sha256()
     try:
-        status = file.stat()
-        last = max(status.st_size - _SAMPLE_BYTES, 0)
-        with file.open("rb") as stream:
-            for sample in range(_SAMPLES):
-                stream.seek(last * sample // (_SAMPLES - 1))
-                digest.update(stream.read(_SAMPLE_BYTES))
+        with open_regular(file) as stream:
+            return [os.fstat(stream.fileno()).st_size, hashlib.file_digest(stream, "sha256").hexdigest()]
     except OSError as error:
         raise MapError(f"{file}: cannot be read: {error.strerror or error}") from error
-    return [file.name, status.st_size, status.st_mtime_ns, digest.hexdigest()]
 
 
 @functools.cache

@@ -11,6 +11,7 @@ import numpy as np
 
 from gsfeatloc_ros.common.geometry import make_pose, matrix_from_quaternion, quaternion_from_matrix
 from gsfeatloc_ros.common.replaced_file import replaced_file
+from gsfeatloc_ros.common.safe_files import open_own
 
 _VERSION = 1
 # Of the file: nothing that is larger was written here.
@@ -43,10 +44,10 @@ def load_pose(path: Path, map_: Mapping[str, Any]) -> np.ndarray:
 
     Raises:
         FileNotFoundError: nothing was saved.
-        OSError: the file cannot be read.
+        OSError: the file cannot be read, or another user may have written it.
         ValueError: it is damaged, or of another map; the message says so.
     """
-    with path.open("rb") as file:
+    with open_own(path) as file:
         data = file.read(_MAX_BYTES + 1)
     try:
         saved = json.loads(data)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import logging
 import os
+import stat
+import zlib
 from dataclasses import fields
 from pathlib import Path
 
@@ -19,7 +21,7 @@ from gsfeatloc_ros.maps import MapError, Similarity, load_map
 from gsfeatloc_ros.maps.ply import write_ply
 from gsfeatloc_ros.render import cache
 from gsfeatloc_ros.render.cache import load_prepared
-from gsfeatloc_ros.render.prepare import PreparedMap, prepare
+from gsfeatloc_ros.render.prepare import LOG2_OPACITY, MEAN_X, PreparedMap, prepare
 from gsfeatloc_ros.simulate.two_rooms import two_rooms
 
 ARRAYS = [field.name for field in fields(PreparedMap) if "ndarray" in str(field.type)]
@@ -139,8 +141,8 @@ def test_unbundled_sog_is_prepared_again_when_any_of_its_files_changes(tmp_path,
     load_prepared(folder)
     assert len(preparations) == 1
     assert cache_of(folder).is_file()
-    image = next(folder.glob("*.webp"))
-    os.utime(image, ns=(1, 1))
+    scales = folder / "scales.webp"
+    scales.write_bytes((folder / "means_l.webp").read_bytes())
     load_prepared(folder)
     assert len(preparations) == 2
 
@@ -163,13 +165,13 @@ def test_map_that_cannot_be_read_leaves_no_cache(tmp_path, path):
 
 def test_cache_that_cannot_be_written_is_no_error(map_file, caplog):
     """A folder is in the way, which stops root as well."""
-    in_the_way = cache_of(map_file).with_name(f"{cache_of(map_file).name}.{os.getpid()}")
-    in_the_way.mkdir()
+    cache_of(map_file).mkdir()
     with caplog.at_level(logging.DEBUG):
         prepared = load_prepared(map_file)
     assert_same(prepared, prepare(load_map(map_file)))
-    assert [record.levelno for record in caplog.records if record.name == cache.__name__] == [logging.DEBUG]
-    assert not cache_of(map_file).exists()
+    levels = [record.levelno for record in caplog.records if record.name == cache.__name__]
+    assert levels == [logging.WARNING, logging.DEBUG]
+    assert not list(map_file.parent.glob(".*"))
 
 
 def damaged_copies(content: bytes) -> dict[str, bytes]:
@@ -214,18 +216,90 @@ def test_no_flipped_byte_goes_unnoticed(map_file, data):
     assert_same(load_prepared(map_file), expected)
 
 
-def test_header_that_claims_much_takes_no_memory(map_file, caplog):
-    load_prepared(map_file)
-    path = cache_of(map_file)
-    content = path.read_bytes()
+def forged(map_path: Path, **header) -> None:
+    """Change the cache's header, with a checksum that fits."""
+    content = cache_of(map_path).read_bytes()
     start = content.index(b"{")
-    length = int.from_bytes(content[start - 4 : start], "little")
-    header = json.loads(content[start : start + length])
-    header["arrays"]["sh"] = ["<f2", [10**9, 48, 256]]
-    encoded = json.dumps(header).encode()
-    path.write_bytes(content[: start - 4] + len(encoded).to_bytes(4, "little") + encoded + content[start + length :])
+    end = start + int.from_bytes(content[start - 4 : start], "little")
+    encoded = json.dumps(json.loads(content[start:end]) | header).encode()
+    checksum = zlib.crc32(content[end:], zlib.crc32(encoded))
+    parts = [content[: start - 8], checksum.to_bytes(4, "little"), len(encoded).to_bytes(4, "little"), encoded]
+    cache_of(map_path).write_bytes(b"".join([*parts, content[end:]]))
+
+
+@pytest.mark.parametrize(
+    ("lie", "says"),
+    [
+        ({"chunks": 2**24}, "is truncated"),
+        ({"chunks": 10**400}, "is damaged"),
+        ({"chunks": -1}, "is damaged"),
+        ({"chunks": 1.0}, "is damaged"),
+        ({"chunks": None}, "is damaged"),
+        ({"sh_coefficients": 9}, "is truncated"),
+        ({"sh_coefficients": 0}, "is damaged"),
+        ({"sh_coefficients": [16]}, "is damaged"),
+        ({"antialiased": 1}, "is damaged"),
+    ],
+)
+def test_shapes_that_the_arrays_cannot_have_are_refused_before_memory_is_taken(map_file, caplog, lie, says):
     load_prepared(map_file)
-    assert "is truncated" in caplog.text
+    forged(map_file, **lie)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cache.np, "fromfile", lambda *arguments: pytest.fail("memory is taken"))
+        with cache_of(map_file).open("rb") as stream, pytest.raises(cache._CacheError, match=says):
+            cache._read(stream, cache_origin(map_file))
+    load_prepared(map_file)
+    assert says in caplog.text
+
+
+def cache_origin(map_path: Path) -> dict:
+    content = cache_of(map_path).read_bytes()
+    start = content.index(b"{")
+    return json.loads(content[start : start + int.from_bytes(content[start - 4 : start], "little")])["origin"]
+
+
+@pytest.mark.parametrize(
+    ("array", "where", "value"),
+    [
+        ("gaussians", np.s_[0, MEAN_X, 3], np.nan),
+        ("gaussians", np.s_[0, MEAN_X, 3], np.inf),
+        ("gaussians", np.s_[0, LOG2_OPACITY, 3], 2.0),
+        ("gaussians", np.s_[0, LOG2_OPACITY, 3], np.nan),
+        ("sh", np.s_[0, 0, 3], np.inf),
+        ("sh", np.s_[0, 0, 3], np.nan),
+    ],
+)
+def test_values_that_no_map_gives_are_damage(map_file, caplog, preparations, array, where, value):
+    """Even with a checksum that fits."""
+    prepared = load_prepared(map_file)
+    origin = cache_origin(map_file)
+    getattr(prepared, array)[where] = value
+    with cache_of(map_file).open("wb") as stream:
+        cache._write(stream, prepared, origin)
+    load_prepared(map_file)
+    assert "is damaged" in caplog.text
+    assert len(preparations) == 2
+
+
+def moved(map_path: Path) -> None:
+    """Move the Gaussians in the cache, with a checksum that fits: it would be believed."""
+    prepared = load_prepared(map_path)
+    prepared.gaussians[:, MEAN_X] += 1.0
+    origin = cache_origin(map_path)
+    with cache_of(map_path).open("wb") as stream:
+        cache._write(stream, prepared, origin)
+
+
+def test_a_cache_that_others_can_have_written_is_not_believed(map_file, caplog, preparations, untrusted):
+    """As who owns it, its mode or its kind says; and it is replaced."""
+    moved(map_file)
+    says = untrusted(cache_of(map_file))
+    assert_same(load_prepared(map_file), prepare(load_map(map_file)))
+    assert len(preparations) == 2
+    assert says in caplog.text
+    load_prepared(map_file)
+    assert len(preparations) == 2
+    assert stat.S_IMODE(cache_of(map_file).lstat().st_mode) == 0o644
 
 
 def test_content_is_that_of_a_copy_and_not_of_another_map(map_file, tmp_path) -> None:

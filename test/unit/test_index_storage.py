@@ -105,6 +105,16 @@ def test_a_folder_cannot_be_read(tmp_path) -> None:
         load_index(tmp_path)
 
 
+def test_what_others_can_have_written_is_not_read(index, path, untrusted) -> None:
+    save_index(path, index, KEY)
+    says = untrusted(path)
+    with pytest.raises(OSError) as refusal:  # noqa: PT011
+        load_index(path, KEY)
+    assert says in str(refusal.value)
+    save_index(path, index, KEY)
+    assert load_index(path, KEY) is not None
+
+
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(share=st.floats(0, 1, exclude_max=True))
 def test_a_cut_file_is_damaged(saved, path, share: float) -> None:

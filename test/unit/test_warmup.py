@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import stat
 import subprocess
 import sys
 from pathlib import Path
@@ -11,7 +12,7 @@ from pathlib import Path
 import pytest
 
 import gsfeatloc_ros
-from gsfeatloc_ros.common.kernel_cache import can_write, user_cache_folder
+from gsfeatloc_ros.common.kernel_cache import can_write, kernel_cache_folder, set_kernel_cache, user_cache_folder
 from gsfeatloc_ros.localize.estimate import Status
 from gsfeatloc_ros.localize.first_run import warm_up
 from gsfeatloc_ros.match import create_matcher
@@ -129,6 +130,33 @@ def test_without_any_writable_home_kernels_are_kept_for_the_process(unwritable_i
     where = Path(cache_dir(unwritable_install, HOME=str(tmp_path / "home"), TMPDIR=str(tmp_path)))
     assert where.parent.parent == tmp_path
     assert can_write(where)
+
+
+@pytest.mark.parametrize("kind", ["of a stranger", "loose", "a link", "a file", "in a folder of all"])
+def test_kernels_that_others_can_have_compiled_are_not_loaded(tmp_path, monkeypatch, caplog, kind):
+    """What lies there is code: others are kept for the process, and it is said."""
+    root = tmp_path / "mine"
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(root))
+    set_kernel_cache()
+    folder = kernel_cache_folder()
+    assert folder.parent == root
+    assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+    if kind == "of a stranger":
+        if os.geteuid() != 0:
+            pytest.skip("only root can give files away")
+        os.chown(folder, 12345, 12345)
+    elif kind == "loose":
+        folder.chmod(0o770)
+    elif kind == "in a folder of all":
+        root.chmod(0o777)
+    else:
+        folder.rename(tmp_path / "elsewhere")
+        folder.symlink_to(tmp_path / "elsewhere") if kind == "a link" else folder.touch()
+    for _ in range(2):
+        set_kernel_cache()
+        assert root not in kernel_cache_folder().parents
+        assert can_write(kernel_cache_folder())
+    assert caplog.text.count("for this run only") == 1
 
 
 def test_relative_cache_home_is_ignored(monkeypatch):
