@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -47,6 +47,13 @@ class Photo:
         image, camera = self.camera.limit(self.image, max_width)
         seen = cv2.resize(self.seen.astype(np.uint8), (camera.width, camera.height), interpolation=cv2.INTER_NEAREST)
         return Photo(image, seen.astype(bool), camera)
+
+    def mirrored(self) -> Photo:
+        """Return its mirror image, left for right. How the camera moved while it took the photo is left out."""
+        K = self.camera.K.copy()
+        K[0, 2] = self.camera.width - 1 - K[0, 2]
+        image, seen = (np.ascontiguousarray(picture[:, ::-1]) for picture in (self.image, self.seen))
+        return Photo(image, seen, replace(self.camera, K=K, readout=None))
 
     def gray(self) -> np.ndarray:
         """Return the brightness (H, W) uint8."""

@@ -19,6 +19,7 @@ from gsfeatloc_ros.evaluate.dataset import PosedPhoto, Scene
 from gsfeatloc_ros.evaluate.metrics import finite_numbers
 from gsfeatloc_ros.evaluate.protocol import PROTOCOLS, PhotoPrior
 from gsfeatloc_ros.evaluate.scene import load_scene_renderer
+from gsfeatloc_ros.index import IndexOptions, build_index
 from gsfeatloc_ros.localize.engine import load_matcher
 from gsfeatloc_ros.localize.estimate import Estimate, Status
 from gsfeatloc_ros.localize.localizer import Localizer
@@ -38,13 +39,20 @@ class NegativeOptions:
 
     Attributes:
         sigma: scale of the priors' errors.
-        seed: of the priors, of the noise and of the localizer.
+        seed: of the priors, of the noise, of the localizer and of the index.
         limit: at most this many of the photos of each scene; 0 for all.
+        without_prior: whether they are looked for without a prior, by an index of the map's views.
     """
 
     sigma: float = 1.0
     seed: int = 0
     limit: int = 0
+    without_prior: bool = False
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """Those of NEGATIVES that are not one and the same."""
+        return tuple(kind for kind in NEGATIVES if kind != "mirror-pose" or not self.without_prior)
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,16 +189,16 @@ def localize_negatives(
         for scene in scenes:
             renderer = load_scene_renderer(scene, RendererSettings())
             matcher = load_matcher(MatcherSettings(name=matcher_name), renderer.device)
-            localizer = Localizer(renderer, matcher, LocalizerOptions(seed=options.seed))
+            index = build_index(renderer, matcher, IndexOptions(seed=options.seed)) if options.without_prior else None
+            localizer = Localizer(renderer, matcher, LocalizerOptions(seed=options.seed), index=index)
             others = [other for other in scenes if other is not scene]
-            kinds: list[str | Scene] = [*NEGATIVES, *others]
+            kinds: list[str | Scene] = [*options.kinds, *others]
             drawn = [draw_negatives(scene, kind, options) for kind in kinds]
             for negative in itertools.chain.from_iterable(drawn):
-                image = negative.read()
+                image, prior = negative.read(), negative.prior
+                given = (None, None) if options.without_prior else (prior.T_map_camera, prior.covariance)
                 start = time.process_time()
-                estimate = localizer.localize(
-                    image, negative.camera, negative.prior.T_map_camera, negative.prior.covariance
-                )
+                estimate = localizer.localize(image, negative.camera, *given)
                 seconds = time.process_time() - start
                 yield NegativeResult(scene.name, matcher_name, negative.kind, negative.name, estimate, seconds)
 

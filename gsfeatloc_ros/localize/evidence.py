@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+import math
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
@@ -16,14 +17,16 @@ _COVERAGE_CELLS = (8, 6)
 # standard deviation.
 _MAX_FOCAL_ERROR = 0.01
 _FOCAL_SIGMAS = 2.0
-# Of a pose that no prior expects so many times the risk is taken: a mirror image, or a wall seen from behind, is one.
+# Of a pose that no prior expects so many times the risk is taken, for a mirror image may be one; and of one that is so
+# many times less likely to be wrong than what the photo's mirror image suggests, all of it.
 _UNEXPECTED = 1e-5
+_MIRROR_IS_WORSE = 1e-2
 # The weights of what tells right from wrong answers (docs/trust.md), and what their sum is shifted and scaled by to be
 # the logarithm of the odds that the answer is wrong. Ratios count by their logit, correlations by Fisher's z.
 _WEIGHTS = {"inlier_ratio": -1.11, "render_inlier_ratio": -1.61, "correlation": -5.03, "low_correlation": -2.22}
 _OFFSET, _SLOPE = 13.81, 3.07
 # How numbers are written as texts, if not with three decimals.
-_FORMATS = {"probability_wrong": ".1e", "focal_error": ".4f", "focal_sigma": ".4f"}
+_FORMATS = {"probability_wrong": ".1e", "mirror_probability_wrong": ".1e", "focal_error": ".4f", "focal_sigma": ".4f"}
 # Ratios and correlations are taken to be no nearer to 1 than this.
 _MIN_DOUBT = 0.005
 
@@ -49,6 +52,9 @@ class Evidence:
         focal_error: how much longer than calibrated the focal length fits the photo, relative.
         focal_sigma: standard deviation of that.
         probability_wrong: that the pose is wrong.
+        mirror_probability_wrong: the same of the pose that the index suggests for the photo's mirror image, 1 where it
+            suggests none; NaN where the index was not asked, as it is of a pose that no prior expects and that is not
+            certain.
         passes: number of renders at estimates.
         views: number of other views than the prior's that were searched.
         searched: number of the index's views that were compared with the photo.
@@ -71,6 +77,7 @@ class Evidence:
     focal_error: float = float("nan")
     focal_sigma: float = float("nan")
     probability_wrong: float = float("nan")
+    mirror_probability_wrong: float = float("nan")
     passes: int = 0
     views: int = 0
     searched: int = 0
@@ -116,7 +123,8 @@ class Limits:
     # know.
     max_deviation: float = parameter(
         8.0,
-        "Farther than this many standard deviations from the prior, or without one, 1e-5 of max_risk is taken.",
+        "Farther than this many standard deviations from the prior, or without one, the mirror image must not fit, or "
+        "1e-5 of max_risk is taken.",
         (0.1, 1e6),
         live=True,
     )
@@ -136,10 +144,9 @@ def verdict(evidence: Evidence, limits: Limits) -> tuple[str, ...]:
     if evidence.inliers < limits.min_inliers:
         reasons.append(f"{evidence.counts} (at least {limits.min_inliers} needed)")
     # Written so that NaN is a reason.
-    expected = evidence.deviation <= limits.max_deviation
-    max_risk = limits.max_risk * (1.0 if expected else _UNEXPECTED)
+    max_risk = limits.max_risk * (1.0 if _is_expected(evidence, limits) else _UNEXPECTED)
     if not evidence.probability_wrong <= max_risk:
-        why = _unexpected(evidence, limits)
+        why = _why_so_little_risk(evidence, limits)
         reasons.append(
             f"it is wrong with a probability of {evidence.probability_wrong:.1g} (at most {max_risk:g}{why}): "
             f"{evidence.inlier_ratio:.0%} of the photo's corners and {evidence.render_inlier_ratio:.0%} of the "
@@ -151,11 +158,28 @@ def verdict(evidence: Evidence, limits: Limits) -> tuple[str, ...]:
     return tuple(reasons)
 
 
-def _unexpected(evidence: Evidence, limits: Limits) -> str:
-    """Return in words why less risk is taken with a pose; nothing for one that the prior expects."""
+def _is_expected(evidence: Evidence, limits: Limits) -> bool:
+    """Return whether a pose is where the prior says, or fits the photo much better than its mirror image fits."""
+    mirror_is_worse = evidence.probability_wrong <= _MIRROR_IS_WORSE * evidence.mirror_probability_wrong
+    return evidence.deviation <= limits.max_deviation or mirror_is_worse
+
+
+def _why_so_little_risk(evidence: Evidence, limits: Limits) -> str:
+    """Return in words why less risk is taken with a pose; nothing for one that is expected."""
+    if _is_expected(evidence, limits):
+        return ""
+    if evidence.mirror_probability_wrong < 1:
+        return ", for the photo's mirror image fits about as well: is the image flipped?"
     if evidence.deviation > limits.max_deviation:
         return f", for the pose is {evidence.deviation:.1f} standard deviations from the prior"
-    return "" if evidence.deviation <= limits.max_deviation else " without a prior"
+    return " without a prior"
+
+
+def is_uncertain(evidence: Evidence, limits: Limits) -> bool:
+    """Return whether nothing but the photo's mirror image, which was not looked for yet, can decide on the pose."""
+    if not math.isnan(evidence.mirror_probability_wrong):
+        return False
+    return bool(verdict(evidence, limits)) and not verdict(replace(evidence, mirror_probability_wrong=1.0), limits)
 
 
 def focal_length_is_wrong(evidence: Evidence) -> bool:

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import islice
 
 import cv2
 import numpy as np
@@ -22,6 +23,7 @@ from gsfeatloc_ros.localize.evidence import (
     Evidence,
     coverage,
     focal_length_is_wrong,
+    is_uncertain,
     probability_wrong,
     verdict,
 )
@@ -40,6 +42,9 @@ _MAX_SETTLED_OFFSET = 0.5
 _BLUR_THAT_DOUBLES_ERRORS = 25.0
 # Matches farther off than this many pixels say nothing of the camera.
 _MAX_CAMERA_ERROR = 20.0
+# Views of the index that the photo's mirror image is compared with, and suggested poses of it that are followed.
+_MIRROR_VIEWS = 24
+_MIRROR_POSES = 2
 # Of two places that explain the photo, one is the better if it leads by so many standard deviations of chance.
 _MIN_LEAD = 3.0
 
@@ -140,7 +145,7 @@ class Localizer:
         search = Search(small, prior, self._now)
         rejected: _Candidate | None = None
         for pose in search.poses():
-            candidate = self._refine(query, pose, prior)
+            candidate = self._compared_with_mirror(query, self._refine(query, pose, prior))
             if candidate.believed:
                 best, rivals = self._best(query, candidate, search, prior)
                 return best.trace(query.photo, search, rivals)
@@ -158,7 +163,7 @@ class Localizer:
         equals: list[_Candidate] = []
         for pose in search.rivals(found.view):
             rival = self._refine(query, pose, prior)
-            if not rival.believed:
+            if not (rival.believed or is_uncertain(rival.evidence, self._components.options.limits)):
                 continue
             with query.clock.stage("verify"):
                 lead = preference(query.photo, found.view, rival.view)
@@ -167,6 +172,23 @@ class Localizer:
             elif lead < _MIN_LEAD:
                 equals.append(rival)
         return found, equals
+
+    def _compared_with_mirror(self, query: Query, candidate: _Candidate) -> _Candidate:
+        """Ask the index for a pose of the photo's mirror image, where that decides whether the candidate is believed.
+
+        Nearly symmetric objects explain the mirror images of their photos well, but not as well as the photos.
+        """
+        components, limits = query.components, query.components.options.limits
+        if components.index is None or not is_uncertain(candidate.evidence, limits):
+            return candidate
+        options = components.options
+        few = replace(options, search=replace(options.search, max_views=_MIRROR_VIEWS))
+        mirror = Query(replace(components, options=few), query.photo.mirrored(), query.clock)
+        search = Search(mirror.limited(SEARCH_WIDTH), None, self._now)
+        found = [self._refine(mirror, pose, None).evidence for pose in islice(search.poses(), _MIRROR_POSES)]
+        best = min((e.probability_wrong for e in found if e.inliers >= limits.min_inliers), default=1.0)
+        evidence = replace(candidate.evidence, mirror_probability_wrong=best)
+        return replace(candidate, evidence=evidence, reasons_against=verdict(evidence, limits))
 
     def _refine(self, query: Query, pose: np.ndarray, prior: Prior | None) -> _Candidate:
         """Render and track at `pose`, then at each estimate, until the render is where the photo is; then verify."""

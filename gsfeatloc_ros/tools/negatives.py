@@ -43,7 +43,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _localize(options: argparse.Namespace, matchers: Sequence[str]) -> list[NegativeResult]:
     """Localize all negatives, with a bar that shows how far it is."""
     scenes = [load_scene(folder) for folder in options.scene]
-    drawn = NegativeOptions(options.sigma, options.seed, options.limit)
+    drawn = NegativeOptions(options.sigma, options.seed, options.limit, options.no_prior)
     results = []
     with tqdm(localize_negatives(scenes, matchers, drawn), unit="photo") as progress:
         for result in progress:
@@ -60,6 +60,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--matcher", default=DEFAULT_MATCHER, help=f"of {', '.join(MATCHERS)}, or several")
     parser.add_argument("--sigma", type=float, default=1.0, help="scale of the priors' errors (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=0, help="of the priors (default: %(default)s)")
+    parser.add_argument(
+        "--no-prior", action="store_true", help="look for them without a prior, by an index of the map's views"
+    )
     parser.add_argument("--limit", type=int, default=0, help="only the first photos of each scene; 0 for all")
     parser.add_argument("--json", type=Path, help="write the answers to this file")
     return parser

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gsfeatloc_ros.common.geometry import make_pose, so3_exp
-from gsfeatloc_ros.localize.evidence import Evidence, Limits, coverage, probability_wrong, verdict
+from gsfeatloc_ros.localize.evidence import Evidence, Limits, coverage, is_uncertain, probability_wrong, verdict
 from gsfeatloc_ros.localize.prior import Prior
 from gsfeatloc_ros.localize.protection import protection_level
 
@@ -67,6 +67,21 @@ def test_a_pose_that_no_prior_expects_must_be_much_surer(deviation: float, says:
     (reason,) = verdict(unsure, Limits())
     assert f"(at most 1e-09{says})" in reason
     assert verdict(replace(unsure, deviation=8.0), Limits()) == ()
+
+
+@pytest.mark.parametrize("deviation", [9.0, float("nan")])
+def test_the_mirror_image_decides_on_a_pose_that_no_prior_expects(deviation: float) -> None:
+    unsure = replace(GOOD, probability_wrong=1e-6, deviation=deviation)
+    assert is_uncertain(unsure, Limits())
+    nothing, better = (replace(unsure, mirror_probability_wrong=p) for p in (1.0, 1e-5))
+    assert verdict(nothing, Limits()) == ()
+    (reason,) = verdict(better, Limits())
+    assert "(at most 1e-09, for the photo's mirror image fits about as well: is the image flipped?)" in reason
+    # It was asked already; it is not to be asked of what is sure, too risky, or refused all the same.
+    for decided in (nothing, better, replace(GOOD, deviation=deviation)):
+        assert not is_uncertain(decided, Limits())
+    for other in (replace(unsure, deviation=1.0), replace(unsure, inliers=5), replace(unsure, probability_wrong=0.01)):
+        assert not is_uncertain(other, Limits())
 
 
 def test_limits_are_those_that_are_given() -> None:

@@ -11,6 +11,7 @@ import pytest
 from small_maps import one_gaussian
 
 from gsfeatloc_ros.common.geometry import rotation_error_deg, translation_error
+from gsfeatloc_ros.common.photo import Photo
 from gsfeatloc_ros.common.stage_clock import Interrupted
 from gsfeatloc_ros.index import IndexOptions, ViewIndex, build_index
 from gsfeatloc_ros.index.storage import index_path, load_index
@@ -55,6 +56,25 @@ def test_a_photo_without_a_prior_is_localized(renderer, matcher, index, room_cam
         assert estimate.evidence.index_views == len(index) == 30
         assert 0 < estimate.evidence.searched <= 30
         assert np.isnan(estimate.evidence.deviation)
+
+
+def test_where_the_mirror_image_fits_too_the_better_one_is_believed(
+    renderer, matcher, index, room_camera, room_photos, monkeypatch
+) -> None:
+    """Without a prior, of a photo that is half covered by itself upside down."""
+    image = room_photos[0].image.copy()
+    middle = np.s_[100:380, 180:460]
+    image[middle] = image[::-1, ::-1][middle]
+    localizer = Localizer(renderer, matcher, index=index)
+    answer = localizer.localize(image, room_camera)
+    assert answer.localized
+    assert answer.evidence.mirror_probability_wrong == 1.0 > 1e-4 > answer.evidence.probability_wrong > 1e-9
+    # As if the camera flipped its images: the mirror image is what it really saw.
+    true = Photo.undistorted(room_photos[0].image, room_camera, 640)
+    monkeypatch.setattr(Photo, "mirrored", lambda photo: true)
+    refusal = localizer.localize(image, room_camera)
+    assert refusal.status is Status.REJECTED
+    assert "is the image flipped?" in refusal.reason
 
 
 def test_a_photo_of_nothing_in_the_map_is_not(renderer, matcher, index, room_camera) -> None:

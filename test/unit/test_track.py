@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 
 import cv2
@@ -111,6 +112,17 @@ def test_a_photo_loses_its_distortion_and_its_size_once(model: str) -> None:
     assert smaller.image.shape == (30, 40, 3)
     assert smaller.seen.shape == (30, 40)
     assert (smaller.camera.width, smaller.camera.height) == (40, 30)
+
+
+def test_the_mirror_image_is_what_the_camera_sees_of_the_mirrored_world() -> None:
+    photo = Photo.undistorted(smooth_noise(0), replace(CAMERA, readout=np.ones(6)), 160)
+    mirror = photo.mirrored()
+    points = np.array([[0.3, -0.2, 2.0], [-0.1, 0.2, 3.0]])
+    x, y = photo.camera.project(points).T
+    np.testing.assert_allclose(mirror.camera.project(points * [-1, 1, 1]), np.column_stack([159 - x, y]))
+    np.testing.assert_array_equal(mirror.image[5, 159 - 30], photo.image[5, 30])
+    assert mirror.camera.readout is None
+    np.testing.assert_array_equal(mirror.mirrored().image, photo.image)
 
 
 @given(gain=st.floats(0.5, 1.0), offset=st.floats(0, 50))
