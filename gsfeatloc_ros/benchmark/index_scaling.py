@@ -17,6 +17,7 @@ import numpy as np
 from gsfeatloc_ros.benchmark.measure import machine
 from gsfeatloc_ros.evaluate.extras import import_extra
 from gsfeatloc_ros.index import IndexOptions, ViewIndex, build_index
+from gsfeatloc_ros.index.landmarks import Landmarks
 from gsfeatloc_ros.index.storage import save_index
 from gsfeatloc_ros.match import Features, create_matcher
 from gsfeatloc_ros.render import create_renderer
@@ -48,12 +49,13 @@ def measure_index(counts: Sequence[int] = COUNTS) -> list[dict[str, Any]]:
     for views in counts:
         rng = np.random.default_rng(0)
         poses = np.broadcast_to(np.eye(4), (views, 4, 4))
-        descriptors = [_descriptors(rng, _VIEW_FEATURES) for _ in range(views)]
-        points = [rng.random((_VIEW_FEATURES, 3)) for _ in range(views)]
+        count = views * _VIEW_FEATURES
+        seen = np.split(np.arange(count), views)
+        landmarks = Landmarks(_descriptors(rng, count), rng.random((count, 3)), seen)
         start = time.process_time()
-        index = ViewIndex.compress(poses, descriptors, points)
+        index = ViewIndex.compress(poses, landmarks)
         made = time.process_time() - start
-        del descriptors, points
+        del landmarks
         rows.append(_row(_MADE_UP, index, made) | _query(index, rng))
     return rows
 

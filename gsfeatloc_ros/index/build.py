@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from gsfeatloc_ros.common.arrays import to_host
 from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.stage_clock import Interrupted
+from gsfeatloc_ros.index.landmarks import View, merge
 from gsfeatloc_ros.index.look_alikes import find_look_alikes
 from gsfeatloc_ros.index.options import IndexOptions
 from gsfeatloc_ros.index.placement import cover, overlap, radius, random_poses, seen_cells, sees
@@ -29,14 +29,9 @@ _VIEW = (320, 240, 288.0)
 _NEAR = 0.02
 # Most features of a view.
 _MAX_FEATURES = 225
-# A feature is confirmed by one of another view at nearly the same point of the map, by the distance from its camera,
-# that looks alike. What is seen from one view only, as the texture of a haze, no photo shows.
-_SAME_POINT = 0.02
-_ALIKE = 0.75
-_NEIGHBOURS = 12
-# A view with so many confirmed features is as good as one with more; no more than so many are kept.
-_ENOUGH_FEATURES = 100
-_MAX_KEPT_FEATURES = 140
+# A view with so many landmarks is as good as one with more; no more than so many are kept.
+_ENOUGH_LANDMARKS = 100
+_MAX_LANDMARKS = 140
 # Views are chosen to suit at most so many photos.
 _MAX_PHOTOS = 5_000
 
@@ -94,38 +89,13 @@ def build_index(
     for number, candidate in enumerate(shortlist):
         check(len(candidates) + number)
         views.append(_look(renderer, matcher, candidates[candidate]))
-    _confirm(views)
-    quality = np.minimum([view.confirmed.sum() / _ENOUGH_FEATURES for view in views], 1.0).astype(np.float32)
-    kept = [views[view] for view in cover(worth[:, shortlist] * quality, options.views)]
+    landmarks = merge(views)
+    quality = np.minimum([len(seen) / _ENOUGH_LANDMARKS for seen in landmarks.seen], 1.0).astype(np.float32)
+    kept = cover(worth[:, shortlist] * quality, options.views)
     progress(total, total)
-    index = ViewIndex.compress(
-        np.array([view.pose for view in kept]).reshape(-1, 4, 4),
-        [view.descriptors[view.confirmed] for view in kept] or [np.empty((0, 1))],
-        [view.points[view.confirmed] for view in kept] or [np.empty((0, 3))],
-    )
+    poses_kept = np.array([views[view].pose for view in kept]).reshape(-1, 4, 4)
+    index = ViewIndex.compress(poses_kept, landmarks.of_views(kept, _MAX_LANDMARKS))
     return replace(index, look_alikes=find_look_alikes(index, _camera(*_VIEW)))
-
-
-@dataclass(eq=False)
-class _View:
-    """A view with its features that have a depth.
-
-    Attributes:
-        pose: (4, 4) T_map_camera.
-        descriptors: (m, D) of the features.
-        points: (m, 3) of the map under them.
-        confirmed: (m,) bool, whether another view shows the same there.
-    """
-
-    pose: np.ndarray
-    descriptors: np.ndarray
-    points: np.ndarray
-    confirmed: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))
-
-    @property
-    def distances(self) -> np.ndarray:
-        """Distances (m,) of the points from the camera."""
-        return np.linalg.norm(self.points - self.pose[:3, 3], axis=1)
 
 
 def _camera(width: int, height: int, focal_length: float) -> Camera:
@@ -133,7 +103,7 @@ def _camera(width: int, height: int, focal_length: float) -> Camera:
     return Camera(width, height, K)
 
 
-def _look(renderer: Renderer, matcher: Matcher, pose: np.ndarray) -> _View:
+def _look(renderer: Renderer, matcher: Matcher, pose: np.ndarray) -> View:
     """Find and lift the features of the view at a pose (4, 4); raise ValueError where they have no descriptors."""
     camera = _camera(*_VIEW)
     render = renderer.render(camera, pose)
@@ -143,24 +113,4 @@ def _look(renderer: Renderer, matcher: Matcher, pose: np.ndarray) -> _View:
     strongest = np.argsort(-to_host(features.scores))[:_MAX_FEATURES]
     lifted = lift(render, camera, pose, to_host(features.keypoints)[strongest].astype(np.float64), LiftOptions())
     descriptors = to_host(features.descriptors)[strongest][lifted.valid]
-    return _View(pose, descriptors.astype(np.float32), lifted.points[lifted.valid])
-
-
-def _confirm(views: list[_View]) -> None:
-    """Mark the features of views that another view confirms."""
-    if not views:
-        return
-    points, descriptors = np.concatenate([v.points for v in views]), np.concatenate([v.descriptors for v in views])
-    distances = np.concatenate([view.distances for view in views])
-    view_of = np.repeat(np.arange(len(views)), [len(view.points) for view in views])
-    confirmed = np.zeros(len(points), bool)
-    if len(points):
-        near, neighbours = cKDTree(points).query(points, k=min(_NEIGHBOURS, len(points)))
-        for gap, other in zip(np.atleast_2d(near.T), np.atleast_2d(neighbours.T), strict=True):
-            same = (gap < _SAME_POINT * distances) & (view_of[other] != view_of)
-            same[same] = (descriptors[same] * descriptors[other[same]]).sum(axis=1) > _ALIKE
-            confirmed |= same
-    starts = np.cumsum([len(view.points) for view in views])[:-1]
-    for view, part in zip(views, np.split(confirmed, starts), strict=True):
-        # The strongest come first.
-        view.confirmed = part & (np.cumsum(part) <= _MAX_KEPT_FEATURES)
+    return View(pose, descriptors.astype(np.float32), lifted.points[lifted.valid])

@@ -20,20 +20,22 @@ SUFFIX = ".gsfeatloc-index"
 
 # A file is this line, the SHA-256 of all that follows it, the length of the header (4 bytes, little-endian), the header
 # (JSON) and the arrays one after another. The line changes with the format.
-_MAGIC = b"gsfeatloc_ros view index 2\n"
+_MAGIC = b"gsfeatloc_ros view index 3\n"
 _MAX_HEADER_BYTES = 64 * 1024
-# Type and shape of the arrays; N views, M features, D / CODE_BYTES numbers for each byte of a code, S look-alikes.
+# Type and shape of the arrays; N views that show F landmarks, of L in all, D / CODE_BYTES numbers for each byte of a
+# code, S look-alikes.
 _ARRAYS: dict[str, tuple[str, tuple[str | int, ...]]] = {
     "poses": ("<f8", ("N", 4, 4)),
     "counts": ("<i4", ("N",)),
-    "points": ("<u2", ("M", 3)),
-    "codes": ("|u1", ("M", CODE_BYTES)),
+    "seen": ("<u4", ("F",)),
+    "points": ("<u2", ("L", 3)),
+    "codes": ("|u1", ("L", CODE_BYTES)),
     "centroids": ("<f2", (CODE_BYTES, 256, "D")),
     "low": ("<f8", (3,)),
     "high": ("<f8", (3,)),
     "look_alikes": ("<f8", ("S", 4, 4)),
 }
-_SIZES = {"N": (1, 1_000_000), "M": (1, 2**31 - 1), "D": (1, 64), "S": (0, 1000)}
+_SIZES = {"N": (1, 1_000_000), "F": (1, 2**31 - 1), "L": (1, 2**31 - 1), "D": (1, 64), "S": (0, 1000)}
 
 
 def index_path(map_path: str | Path) -> Path:
@@ -64,7 +66,8 @@ def save_index(path: Path, index: ViewIndex, key: dict[str, Any]) -> None:
     arrays = {name: np.ascontiguousarray(getattr(index, name), dtype) for name, (dtype, _) in _ARRAYS.items()}
     sizes = {
         "N": len(index),
-        "M": len(index.codes),
+        "F": len(index.seen),
+        "L": len(index.codes),
         "D": index.centroids.shape[2],
         "S": len(index.look_alikes),
     }
@@ -138,6 +141,7 @@ def _read(stream: BinaryIO, path: Path, key: dict[str, Any] | None) -> ViewIndex
     finite = all(
         np.isfinite(getattr(index, name)).all() for name in ("poses", "centroids", "low", "high", "look_alikes")
     )
-    if digest.digest() != checksum or (counts < 0).any() or counts.sum() != sizes["M"] or not finite:
+    adds_up = (counts >= 0).all() and counts.sum() == sizes["F"] and index.seen.max() < sizes["L"]
+    if digest.digest() != checksum or not adds_up or not finite:
         raise damaged
     return index

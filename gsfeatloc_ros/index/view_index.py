@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from functools import cached_property
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
+from scipy.sparse import csr_array
 
+from gsfeatloc_ros.index.landmarks import Landmarks
 from gsfeatloc_ros.match.base import Features, Matches
 from gsfeatloc_ros.match.nearest import match_mutual
 
@@ -35,9 +36,10 @@ class ViewIndex:
 
     Attributes:
         poses: (N, 4, 4) float64, T_map_camera.
-        counts: (N,) int32, number of features of each view; these follow each other in the arrays below.
-        points: (M, 3) uint16, the points of the map under the features, from `low` to `high`.
-        codes: (M, CODE_BYTES) uint8, the features' descriptors, compressed.
+        counts: (N,) int32, number of landmarks that each view shows.
+        seen: (F,) uint32, numbers of these, of one view after the other.
+        points: (L, 3) uint16, the landmarks' points of the map, from `low` to `high`.
+        codes: (L, CODE_BYTES) uint8, their descriptors, compressed.
         centroids: (CODE_BYTES, 256, D / CODE_BYTES) float32, what the bytes of a code stand for.
         low, high: (3,) float64, box of the points, map frame.
         look_alikes: (S, 4, 4) float64, motions of the map frame that carry places to others which look alike.
@@ -45,6 +47,7 @@ class ViewIndex:
 
     poses: np.ndarray
     counts: np.ndarray
+    seen: np.ndarray
     points: np.ndarray
     codes: np.ndarray
     centroids: np.ndarray
@@ -58,15 +61,15 @@ class ViewIndex:
     def rank(self, features: Features) -> np.ndarray:
         """Return the number of features of a photo (N,) float64 that speak for each view.
 
-        A feature has a vote for each view that holds one of those nearest to it.
+        A feature has a vote for each view that shows one of the landmarks nearest to it.
         """
         if len(self.codes) == 0 or len(features) == 0:
             return np.zeros(len(self))
         _, nearest = self._search.search(features.descriptors, min(_VOTES, len(self.codes)))
-        views = np.where(nearest >= 0, self._view_of[nearest], len(self))
-        # One vote a view, of how many of its features ever: repetitive texture must not outvote the rest.
-        votes = np.unique(np.column_stack([np.repeat(np.arange(len(views)), views.shape[1]), views.ravel()]), axis=0)
-        return np.bincount(votes[:, 1], minlength=len(self) + 1)[: len(self)].astype(np.float64)
+        feature, rank = np.nonzero(nearest >= 0)
+        like = csr_array((np.ones(len(feature)), (feature, nearest[feature, rank])), (len(features), len(self.codes)))
+        # One vote a view, of how many of its landmarks ever: repetitive texture must not outvote the rest.
+        return np.asarray(((like @ self._shown) > 0).sum(axis=0), np.float64)
 
     def nearest(self, features: Features, count: int) -> tuple[np.ndarray, np.ndarray]:
         """Find what is nearest to features of a photo in all views; `count` of each, or as many as there are.
@@ -90,39 +93,34 @@ class ViewIndex:
         return matches, points[matches.b[:, 0].astype(int)]
 
     def contents(self, view: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the descriptors (m, D) float32 of a view's features, and the points (m, 3) of the map under them."""
-        kept = slice(self._first[view], self._first[view + 1])
-        return self._decoded(self.codes[kept]), self._points(kept)
+        """Return the descriptors (m, D) float32 of the landmarks that a view shows, and their points (m, 3)."""
+        shown = self._landmarks(view)
+        return self._decoded(self.codes[shown]), self._points(shown)
 
     @cached_property
     def centres(self) -> np.ndarray:
         """What the views look at: the medians (N, 3) of their points, map frame; of a view without any its place."""
         return np.array(
             [
-                np.median(self._points(slice(start, end)), axis=0) if end > start else pose[:3, 3]
-                for pose, (start, end) in zip(self.poses, pairwise(self._first.tolist()), strict=True)
+                np.median(self._points(self._landmarks(view)), axis=0) if self.counts[view] else pose[:3, 3]
+                for view, pose in enumerate(self.poses)
             ]
         ).reshape(-1, 3)
 
     def prepare(self) -> None:
         """Make what the first search would make otherwise: seconds for a large index."""
-        _ = self._search, self.centres
+        _ = self._search, self._shown, self.centres
 
     @staticmethod
-    def compress(poses: np.ndarray, descriptors: list[np.ndarray], points: list[np.ndarray]) -> ViewIndex:
-        """Make an index of views.
-
-        Args:
-            poses: (N, 4, 4) T_map_camera.
-            descriptors: (m, D) float32 unit length of each view's features.
-            points: (m, 3) of each view's features, map frame.
+    def compress(poses: np.ndarray, landmarks: Landmarks) -> ViewIndex:
+        """Make an index of views by their poses (N, 4, 4), T_map_camera, and the landmarks that they show.
 
         Raises:
-            ValueError: there is no feature, or D is no multiple of CODE_BYTES.
+            ValueError: there is no landmark, or the length of descriptors is no multiple of CODE_BYTES.
         """
         import faiss
 
-        every, where = np.concatenate(descriptors), np.concatenate(points)
+        every, where = landmarks.descriptors, landmarks.points
         if len(every) == 0:
             raise ValueError("the map shows nothing that could be recognized: no view of it has features")
         if every.shape[1] % CODE_BYTES:
@@ -135,7 +133,8 @@ class ViewIndex:
         steps = np.round((where - low) / np.maximum(high - low, np.finfo(float).tiny) * _STEPS)
         return ViewIndex(
             poses=np.asarray(poses, np.float64),
-            counts=np.array([len(view) for view in points], np.int32),
+            counts=np.array([len(shown) for shown in landmarks.seen], np.int32),
+            seen=np.concatenate(landmarks.seen).astype(np.uint32),
             points=steps.astype(np.uint16),
             codes=quantizer.compute_codes(every),
             centroids=faiss.vector_to_array(quantizer.centroids).reshape(CODE_BYTES, _VALUES, -1),
@@ -148,11 +147,17 @@ class ViewIndex:
         return np.concatenate([[0], np.cumsum(self.counts, dtype=np.int64)])
 
     @cached_property
-    def _view_of(self) -> np.ndarray:
-        return np.repeat(np.arange(len(self)), self.counts)
+    def _shown(self) -> csr_array:
+        """Which landmark (L) which view (N) shows."""
+        view_of = np.repeat(np.arange(len(self)), self.counts)
+        return csr_array((np.ones(len(self.seen)), (self.seen, view_of)), (len(self.codes), len(self)))
 
-    def _points(self, numbers: slice | np.ndarray) -> np.ndarray:
-        """Return the points (..., 3), map frame, of features by their numbers."""
+    def _landmarks(self, view: int) -> np.ndarray:
+        """Return the numbers (m,) of the landmarks that a view shows."""
+        return self.seen[self._first[view] : self._first[view + 1]]
+
+    def _points(self, numbers: np.ndarray) -> np.ndarray:
+        """Return the points (..., 3), map frame, of landmarks by their numbers."""
         return self.low + self.points[numbers] / _STEPS * (self.high - self.low)
 
     def _decoded(self, codes: np.ndarray) -> np.ndarray:

@@ -8,6 +8,7 @@ import numpy as np
 
 from gsfeatloc_ros.common.geometry import make_pose, so3_exp
 from gsfeatloc_ros.index import ViewIndex
+from gsfeatloc_ros.index.landmarks import Landmarks
 from gsfeatloc_ros.match import Features
 
 
@@ -31,7 +32,14 @@ def made_up_index(views: int, features: int, dimension: int, seed: int = 0) -> M
     poses = np.array([make_pose(so3_exp(rng.normal(size=3)), rng.normal(size=3)) for _ in range(views)])
     descriptors = [unit_vectors(rng, features, dimension) for _ in range(views)]
     points = [rng.uniform([-5, -4, 0], [5, 4, 3], (features, 3)) for _ in range(views)]
-    return MadeUpIndex(ViewIndex.compress(poses, descriptors, points), descriptors, points)
+    return MadeUpIndex(ViewIndex.compress(poses, landmarks_of(descriptors, points)), descriptors, points)
+
+
+def landmarks_of(descriptors: list[np.ndarray], points: list[np.ndarray]) -> Landmarks:
+    """Landmarks with the descriptors (m, D) and points (m, 3) of each view, which no other view shows."""
+    counts = [len(view) for view in points]
+    seen = np.split(np.arange(sum(counts)), np.cumsum(counts)[:-1])
+    return Landmarks(np.concatenate(descriptors), np.concatenate(points), seen)
 
 
 def photo_of(descriptors: np.ndarray, noise: float = 0.0) -> Features:

@@ -20,7 +20,7 @@ from gsfeatloc_ros.index.storage import index_path, load_index, save_index
 
 KEY = {"map": [[1000, "abc"]], "matcher": ["sift", ""]}
 # Bytes of the line and of the checksum before the header, and of the header's length.
-BEFORE_LENGTH, LENGTH = len(b"gsfeatloc_ros view index 2\n") + 32, 4
+BEFORE_LENGTH, LENGTH = len(b"gsfeatloc_ros view index 3\n") + 32, 4
 
 
 @pytest.fixture(scope="module")
@@ -147,11 +147,11 @@ lies = st.one_of(st.integers(-(2**70), 2**70), st.sampled_from([math.inf, math.n
 
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(name=st.sampled_from(["N", "M", "D", "S"]), lie=lies)
+@given(name=st.sampled_from(["N", "F", "L", "D", "S"]), lie=lies)
 @example(name="N", lie=1_000_000)
-@example(name="M", lie=2**31 - 1)
+@example(name="L", lie=2**31 - 1)
 @example(name="D", lie=64)
-@example(name="M", lie=math.inf)
+@example(name="F", lie=math.inf)
 def test_no_memory_is_taken_for_sizes_that_the_file_does_not_have(saved, path, name: str, lie) -> None:
     length = int.from_bytes(saved[BEFORE_LENGTH : BEFORE_LENGTH + LENGTH], "little")
     header = json.loads(saved[BEFORE_LENGTH + LENGTH :][:length])
@@ -192,6 +192,12 @@ def test_counts_that_do_not_add_up_are_damaged(index, path) -> None:
         save_index(path, ViewIndex(**{**vars(index), "counts": np.array(counts, np.int32)}), KEY)
         with pytest.raises(ValueError, match="is damaged"):
             load_index(path)
+
+
+def test_landmarks_that_there_are_none_of_are_damaged(index, path) -> None:
+    save_index(path, replace(index, seen=np.where(index.seen == 5, 12, index.seen)), KEY)
+    with pytest.raises(ValueError, match="is damaged"):
+        load_index(path)
 
 
 def test_an_index_lies_beside_its_map_or_in_the_users_cache(tmp_path, monkeypatch) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from view_indices import photo_of, unit_vectors
+from view_indices import landmarks_of, photo_of, unit_vectors
 
 from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.geometry import make_pose, rotation_error_deg, so3_exp, transform, translation_error
@@ -29,7 +29,8 @@ def twins(motion: np.ndarray, seed: int = 0) -> ViewIndex:
     """An index of a place and of its copy, carried there by a motion (4, 4)."""
     poses, descriptors, points = made_up_place(seed)
     there = [transform(motion, p) for p in points]
-    return ViewIndex.compress(np.array(poses + [motion @ pose for pose in poses]), 2 * descriptors, points + there)
+    landmarks = landmarks_of(2 * descriptors, points + there)
+    return ViewIndex.compress(np.array(poses + [motion @ pose for pose in poses]), landmarks)
 
 
 def are_near(pose: np.ndarray, truth: np.ndarray) -> bool:
@@ -57,7 +58,8 @@ def test_the_motions_to_a_copy_and_back_are_found(motion: np.ndarray, seed: int)
 
 def test_places_that_are_not_alike_have_no_motion() -> None:
     poses, descriptors, points = made_up_place(0, views=8)
-    assert find_look_alikes(ViewIndex.compress(np.array(poses), descriptors, points), CAMERA).shape == (0, 4, 4)
+    index = ViewIndex.compress(np.array(poses), landmarks_of(descriptors, points))
+    assert find_look_alikes(index, CAMERA).shape == (0, 4, 4)
 
 
 def test_a_picture_is_found_at_the_copy_and_nowhere_else() -> None:

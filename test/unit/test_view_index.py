@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from view_indices import made_up_index, photo_of, unit_vectors
+from view_indices import landmarks_of, made_up_index, photo_of, unit_vectors
 
 from gsfeatloc_ros.index import ViewIndex
 from gsfeatloc_ros.match import Features
@@ -39,10 +41,22 @@ def test_features_of_elsewhere_match_hardly_anything() -> None:
 def test_a_feature_seen_again_and_again_has_one_vote_a_view() -> None:
     made = made_up_index(views=3, features=20, dimension=128)
     repeated = np.repeat(made.descriptors[1][:1], 20, axis=0)
-    index = ViewIndex.compress(made.index.poses, [made.descriptors[0], repeated, made.descriptors[2]], made.points)
+    landmarks = landmarks_of([made.descriptors[0], repeated, made.descriptors[2]], made.points)
+    index = ViewIndex.compress(made.index.poses, landmarks)
     votes = index.rank(photo_of(np.concatenate([made.descriptors[0][:5], repeated[:1]])))
     assert votes[1] <= 6
     assert votes[0] >= 5
+
+
+def test_a_landmark_speaks_for_all_views_that_show_it() -> None:
+    made = made_up_index(views=3, features=20, dimension=128)
+    landmarks = landmarks_of(made.descriptors, made.points)
+    shared = [landmarks.seen[0], np.r_[landmarks.seen[0][:15], landmarks.seen[1]], landmarks.seen[2]]
+    index = ViewIndex.compress(made.index.poses, replace(landmarks, seen=shared))
+    votes = index.rank(photo_of(made.descriptors[0]))
+    assert votes[0] == 20
+    assert votes[1] >= 15
+    assert len(index.match(photo_of(made.descriptors[0]), 1)[0]) >= 14
 
 
 def test_an_index_of_one_feature_is_searched() -> None:
@@ -69,7 +83,7 @@ def test_a_photo_without_features_speaks_for_no_view() -> None:
 def test_views_in_one_plane_keep_their_points() -> None:
     made = made_up_index(views=2, features=10, dimension=128)
     flat = [points * [1, 1, 0] + [0, 0, 7] for points in made.points]
-    index = ViewIndex.compress(made.index.poses, made.descriptors, flat)
+    index = ViewIndex.compress(made.index.poses, landmarks_of(made.descriptors, flat))
     _, points = index.match(photo_of(made.descriptors[0]), 0)
     np.testing.assert_allclose(points[:, 2], 7)
 
@@ -85,10 +99,10 @@ def test_the_same_views_give_the_same_index() -> None:
 @pytest.mark.parametrize("dimension", [1, 100])
 def test_nothing_is_no_index(dimension: int) -> None:
     with pytest.raises(ValueError, match="no view of it has features"):
-        ViewIndex.compress(np.empty((0, 4, 4)), [np.empty((0, dimension))], [np.empty((0, 3))])
+        ViewIndex.compress(np.empty((0, 4, 4)), landmarks_of([np.empty((0, dimension))], [np.empty((0, 3))]))
 
 
 def test_descriptors_that_cannot_be_compressed_are_refused() -> None:
     rng = np.random.default_rng(0)
     with pytest.raises(ValueError, match="multiple of 32"):
-        ViewIndex.compress(np.eye(4)[None], [unit_vectors(rng, 300, 100)], [rng.random((300, 3))])
+        ViewIndex.compress(np.eye(4)[None], landmarks_of([unit_vectors(rng, 300, 100)], [rng.random((300, 3))]))
