@@ -17,7 +17,11 @@ MAX_SEED = 2**31 - 1
 
 @dataclass(frozen=True)
 class SearchOptions:
-    """How the index of views is searched, where the prior's view does not show the image."""
+    """How the index of views is searched, where the prior's view does not show the image.
+
+    Attributes:
+        skipped: of the views that most speaks for, so many are left out: they were looked at in vain already.
+    """
 
     max_seconds: float = parameter(
         3.0, "Longest search of the index, in seconds; what was begun by then is ended.", (0.0, 3600.0), live=True
@@ -25,6 +29,7 @@ class SearchOptions:
     max_views: int = parameter(
         100, "Most views of the index that are compared with an image; 0 for none.", (0, 1_000_000), live=True
     )
+    skipped: int = 0
 
 
 @dataclass(frozen=True)

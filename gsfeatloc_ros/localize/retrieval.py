@@ -38,13 +38,16 @@ class Hint:
     weight: float
 
 
-def retrieve(small: Query, index: ViewIndex, likely: Callable[[np.ndarray], bool]) -> Iterator[Hint | None]:
+def retrieve(
+    small: Query, index: ViewIndex, likely: Callable[[np.ndarray], bool], skipped: int = 0
+) -> Iterator[Hint | None]:
     """Yield what each view of an index suggests, the view that most speaks for first; None where it is nothing.
 
     Args:
         small: the photo, at most SEARCH_WIDTH wide.
         index: to look in, of the features of the photo's matcher.
         likely: whether a prior holds a pose (4, 4) for possible; it ranks the views and forbids none.
+        skipped: so many of the first views are left out.
     """
     features = small.features
     if not isinstance(features, Features):
@@ -58,7 +61,7 @@ def retrieve(small: Query, index: ViewIndex, likely: Callable[[np.ndarray], bool
         weights = np.array([weight(pose) for pose in index.poses])
         order = np.argsort(-index.rank(found) * weights, kind="stable")
     group = _Group(small, index, found, order)
-    for view in order:
+    for view in order[skipped:]:
         with small.clock.stage("search"):
             hint = group.hint(view)
         if hint is None:

@@ -143,7 +143,7 @@ class Search:
         index, options = self._small.components.index, self._small.components.options.search
         assert index is not None
         end = self._now() + options.max_seconds
-        hints = islice(retrieve(self._small, index, self._likely), options.max_views)
+        hints = islice(retrieve(self._small, index, self._likely, options.skipped), options.max_views)
         while self._compare(islice(hints, _BATCH)) and self._now() < end:
             yield from self._follow(_MAX_FOLLOWED_VIEWS, MIN_HINT)
         yield from self._follow(_MAX_FOLLOWED_HINTS, _MIN_INDEX_HINT)

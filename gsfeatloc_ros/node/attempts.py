@@ -172,7 +172,7 @@ class Attempts:
             if job.shared and self.publishing:
                 publishers.publish_refused(job.message, error)
             return JobResult(Outcome.refused(error))
-        localizer = engine.with_options(self._options(engine.options, job, query)).localizer
+        localizer = engine.with_options(self._options(engine.options, job)).localizer
         trace = localizer.trace(
             query.image, query.camera, query.T_map_camera_prior, query.prior_covariance, interrupted
         )
@@ -194,9 +194,9 @@ class Attempts:
             self._follower.take_requested(query, header, T_map_camera)
         return result
 
-    def _options(self, options: LocalizerOptions, job: Job, query: LocalizerInput) -> LocalizerOptions:
+    def _options(self, options: LocalizerOptions, job: Job) -> LocalizerOptions:
         """Return the options for a job."""
-        options = self._follower.options(options)
+        options = self._follower.options(options, job.message.header)
         if job.max_seconds > 0:
             options = replace(options, search=replace(options.search, max_seconds=job.max_seconds))
         return options
@@ -206,7 +206,7 @@ class Attempts:
         outputs, estimate = self._outputs, result.outcome.estimate
         assert estimate is not None  # it was tried
         T_map_camera = estimate.T_map_camera
-        judgement = self._follower.take(query, header, T_map_camera)
+        judgement = self._follower.take(query, header, estimate)
         if judgement.decision is Decision.AWAIT:
             result = replace(result, outcome=Outcome.of(estimate, judgement), answer=None)
         elif result.answer is not None and T_map_camera is not None:

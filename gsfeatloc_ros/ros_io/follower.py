@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
 
 from gsfeatloc_ros.common.camera import Camera
+from gsfeatloc_ros.localize.estimate import Estimate
 from gsfeatloc_ros.localize.options import MAX_SEED, LocalizerOptions
 from gsfeatloc_ros.ros_io.decode import frame_name, nanoseconds
 from gsfeatloc_ros.ros_io.inputs import Inputs, LocalizerInput
 from gsfeatloc_ros.ros_io.message_types import AnyImage, Header
 from gsfeatloc_ros.ros_io.prior import Prior, PriorSource
 from gsfeatloc_ros.ros_io.state import Attempt, Decision, Judgement, LocalizationState, is_unattested
+
+# A camera that went no farther, in metres, and turned no more, in radians, sees about the same.
+_SAME_VIEW = (0.15, math.radians(4.5))
 
 
 class Follower:
@@ -32,6 +37,8 @@ class Follower:
         self.images_come = True
         # Of the images that come by themselves.
         self._camera_frame: str | None = None
+        # Views of the index that were looked at in vain, and the stamp of the image from whose place they were.
+        self._looked_at, self._looked_from = 0, 0
 
     def for_image(self, message: AnyImage, camera: Camera | None = None, prior: Prior | None = None) -> LocalizerInput:
         """Return what to localize an image with; arguments and errors as of `Inputs.for_image`."""
@@ -41,18 +48,25 @@ class Follower:
             query = self._inputs.for_image(message, camera, prior)
         return query
 
-    def options(self, options: LocalizerOptions) -> LocalizerOptions:
-        """Return the options for the next image: what was searched in vain is searched otherwise, with another seed."""
-        return replace(options, seed=(options.seed + self.state.failures) % (MAX_SEED + 1))
+    def options(self, options: LocalizerOptions, header: Header) -> LocalizerOptions:
+        """Return the options for the next image, of this header: what was searched in vain is searched otherwise.
 
-    def take(self, query: LocalizerInput, header: Header, T_map_camera: np.ndarray | None) -> Judgement:
+        That is with another seed, and in other views of the index until the camera has moved.
+        """
+        skipped = self._looked_at if self._is_where_it_looked(header) else 0
+        seed = (options.seed + self.state.failures) % (MAX_SEED + 1)
+        return replace(options, seed=seed, search=replace(options.search, skipped=skipped))
+
+    def take(self, query: LocalizerInput, header: Header, estimate: Estimate) -> Judgement:
         """Take what came of an image that came by itself, and return what is to be done.
 
         Args:
             query: what the image was localized with.
             header: of the image.
-            T_map_camera: (4, 4) the answer; None for none.
+            estimate: the answer, or none.
         """
+        T_map_camera = estimate.T_map_camera
+        self._note_search(header, estimate)
         self._camera_frame = frame_name(header.frame_id)
         attempt = Attempt(
             query.source, query.T_map_camera_prior, query.prior_covariance, T_map_camera, self._confirmable(header)
@@ -89,6 +103,19 @@ class Follower:
     def pass_time(self, images_wanted: bool) -> None:
         """Note that time has passed, perhaps without images, though they may be wanted."""
         self.state.pass_time(self._inputs.carried_sigma(), images_wanted)
+
+    def _note_search(self, header: Header, estimate: Estimate) -> None:
+        """Note how many views of the index were looked at in vain; once all were, they are looked at anew."""
+        if not self._is_where_it_looked(header):
+            self._looked_at, self._looked_from = 0, nanoseconds(header.stamp)
+        looked_at = self._looked_at + estimate.evidence.searched
+        found = estimate.T_map_camera is not None
+        self._looked_at = 0 if found or looked_at >= estimate.evidence.index_views else looked_at
+
+    def _is_where_it_looked(self, header: Header) -> bool:
+        """Return whether the camera is known to be where views of the index were last looked at from."""
+        travelled = self._inputs.travelled(self._looked_from, nanoseconds(header.stamp))
+        return travelled is not None and travelled.distance <= _SAME_VIEW[0] and travelled.turn <= _SAME_VIEW[1]
 
     def _confirmable(self, header: Header) -> bool:
         stamp = nanoseconds(header.stamp)

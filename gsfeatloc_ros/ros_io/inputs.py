@@ -14,7 +14,7 @@ from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.geometry import invert, rotate_covariance, shift_covariance
 from gsfeatloc_ros.ros_io.calibration import decode_camera
 from gsfeatloc_ros.ros_io.decode import PictureError, decode_pose, frame_name, nanoseconds, picture_size
-from gsfeatloc_ros.ros_io.growth import Growth, position_sigma
+from gsfeatloc_ros.ros_io.growth import Growth, Travelled, position_sigma
 from gsfeatloc_ros.ros_io.message_types import AnyImage
 from gsfeatloc_ros.ros_io.message_types import Odometry as OdometryMessage
 from gsfeatloc_ros.ros_io.odometry import OdometryBuffer
@@ -197,6 +197,10 @@ class Inputs:
     def has_odometry(self, stamp: int) -> bool:
         """Return whether odometry says where the robot was at `stamp` (nanoseconds)."""
         return self._odometry.motion(stamp, stamp) is not None
+
+    def travelled(self, start: int, end: int) -> Travelled | None:
+        """Return how far the robot went between two times (nanoseconds); None where odometry does not tell."""
+        return self._odometry.travelled(start, end)
 
     def carried_sigma(self) -> float | None:
         """Return the standard deviation of the last answer's position as odometry has carried it up to now.

@@ -6,7 +6,10 @@ import numpy as np
 import pytest
 from ros_messages import SECOND, camera_info, image, odometry, prior
 
-from gsfeatloc_ros.common.geometry import make_pose
+from gsfeatloc_ros.common.geometry import make_pose, so3_exp
+from gsfeatloc_ros.localize.estimate import Estimate, Status
+from gsfeatloc_ros.localize.evidence import Evidence
+from gsfeatloc_ros.localize.options import LocalizerOptions
 from gsfeatloc_ros.ros_io.follower import Follower
 from gsfeatloc_ros.ros_io.inputs import Inputs, InputTopic
 from gsfeatloc_ros.ros_io.prior import PriorPolicy, PriorSource, decode_prior
@@ -25,20 +28,23 @@ class Robot:
         self.inputs = Inputs(PriorPolicy(), lambda target, source, at: np.eye(4), False, "no camera_info yet")
         self.inputs.take(InputTopic.CAMERA_INFO, camera_info())
         self.follower = Follower(self.inputs, LocalizationState(StateOptions(), lambda: self.time), track)
+        self.speed, self.searched = 1.0, 0
         self._driven = 99.0 if has_odometry else np.inf
 
     def drive(self, seconds: float) -> None:
         """Go on up to a time."""
         self.time = round(seconds * SECOND)
         while self._driven <= seconds:
-            self.inputs.take(InputTopic.ODOMETRY, odometry(self._driven, along(self._driven), "camera"))
+            self.inputs.take(InputTopic.ODOMETRY, odometry(self._driven, along(self.speed * self._driven), "camera"))
             self._driven += 0.1
 
     def see(self, seconds: float, pose: np.ndarray | None) -> tuple[PriorSource | None, Decision]:
         """What an image is localized with, and what is to be done, where this is the answer."""
         self.drive(seconds)
         query = self.follower.for_image(image(seconds))
-        decision = self.follower.take(query, image(seconds).header, pose).decision
+        status = Status.FAILED if pose is None else Status.LOCALIZED
+        estimate = Estimate(status, "", pose, evidence=Evidence(searched=self.searched, index_views=250))
+        decision = self.follower.take(query, image(seconds).header, estimate).decision
         return query.source, decision
 
     def ask(self, seconds: float, pose: np.ndarray, frame: str = "camera", with_prior: bool = False) -> None:
@@ -63,6 +69,36 @@ def test_found_without_a_prior_and_followed():
     robot.drive(104)
     query = robot.follower.for_image(image(104))
     np.testing.assert_allclose(query.T_map_camera_prior, along(4), atol=1e-9)
+
+
+def skipped(robot: Robot, seconds: float) -> int:
+    """How many views of the index an image leaves out."""
+    robot.drive(seconds)
+    return robot.follower.options(LocalizerOptions(), image(seconds).header).search.skipped
+
+
+def test_a_robot_that_stands_looks_at_other_views_each_time() -> None:
+    robot = Robot()
+    robot.speed, robot.searched = 0.0, 100
+    expected = [0, 100, 200, 0, 100]  # of 250
+    for seconds, left_out in enumerate(expected, start=100):
+        assert skipped(robot, seconds) == left_out
+        robot.see(seconds, None)
+    robot.see(105, along(0))
+    assert skipped(robot, 106) == 0
+
+
+@pytest.mark.parametrize("how", ["it moves", "it turns", "nobody knows"])
+def test_a_robot_that_may_have_moved_looks_at_the_likeliest_views(how: str) -> None:
+    robot = Robot(has_odometry=how != "nobody knows")
+    robot.speed, robot.searched = float(how == "it moves"), 100
+    robot.see(100, None)
+    if how == "it turns":
+        robot.drive(101)
+        turned = make_pose(so3_exp(np.array([0.0, 0.1, 0.0])), np.zeros(3))
+        robot.inputs.take(InputTopic.ODOMETRY, odometry(101.3, turned, "camera"))
+    assert skipped(robot, 100.1) == 0 if how == "nobody knows" else skipped(robot, 100.1) == 100
+    assert skipped(robot, 101.3) == 0
 
 
 def test_without_odometry_it_is_found_at_once():
