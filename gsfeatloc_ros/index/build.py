@@ -20,7 +20,7 @@ from gsfeatloc_ros.pose.lift import LiftOptions, lift
 from gsfeatloc_ros.render.base import Renderer
 
 # Poses that are looked at small for each view that is wanted, and how many of them are looked at closely.
-_CANDIDATES_PER_VIEW = 20
+_CANDIDATES_PER_VIEW = 10
 _SHORTLIST = 2
 # Width, height and focal length, in pixels, of small views and of views.
 _SMALL_VIEW = (80, 60, 72.0)

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 # Features are of one landmark if they lie at nearly the same point of the map, by the distance from their cameras, and
 # look alike.
 _SAME_POINT = 0.02
-_ALIKE = 0.75
+_ALIKE = 0.8
 # A feature is compared with so many that are nearest.
 _NEIGHBOURS = 12
 

@@ -16,5 +16,5 @@ class IndexOptions:
         "",
         "Path of the index of views; empty for a file beside the map (*.gsfeatloc-index) or in the user's cache.",
     )
-    views: int = parameter(240, "Number of views in an index that is made.", (1, 100_000))
+    views: int = parameter(480, "Number of views in an index that is made.", (1, 100_000))
     seed: int = parameter(0, "Seed of the places of the views.", (0, 2**31 - 1))
