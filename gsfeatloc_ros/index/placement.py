@@ -18,6 +18,9 @@ from gsfeatloc_ros.render.base import Render
 _OUTLIERS = 1.0  # per cent
 _GROWTH = 0.25
 _DISTANCES = (0.1, 2.0)
+# Where up is in the map's frame, by ROS's convention; if it is elsewhere, views of one thing are still turned alike.
+_UP = np.array([0.0, 0.0, 1.0])
+_MAX_TILT = 0.1
 # Views that show so little, or of which so much is too near, are of no use.
 _MIN_SEEN = 0.2
 _MAX_NEAR = 0.05
@@ -152,10 +155,10 @@ def _box(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _aimed(position: np.ndarray, target: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return the pose (4, 4) of a camera at `position` (3,) that looks at `target` (3,), rolled by any angle."""
+    """Return the pose (4, 4) of a camera at `position` (3,) that looks at `target` (3,), nearly upright."""
     z = target - position
-    z = z / np.linalg.norm(z) if z.any() else np.array([0.0, 0.0, 1.0])
-    x = np.cross(z, rng.normal(size=3))
+    z = z / np.linalg.norm(z) if z.any() else np.array([1.0, 0.0, 0.0])
+    x = np.cross(z, _UP + _MAX_TILT * rng.normal(size=3))
     x /= np.linalg.norm(x)
     return make_pose(np.column_stack([x, np.cross(z, x), z]), position)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -44,7 +44,8 @@ def retrieve(
     """Yield what each view of an index suggests, the view that most speaks for first; None where it is nothing.
 
     Args:
-        small: the photo, at most SEARCH_WIDTH wide.
+        small: the photo, at most SEARCH_WIDTH wide. It is looked for upside down and on its sides too, where its
+            features are told only the same way up: nobody says which way is up in the map.
         index: to look in, of the features of the photo's matcher.
         likely: whether a prior holds a pose (4, 4) for possible; it ranks the views and forbids none.
         skipped: so many of the first views are left out.
@@ -56,19 +57,33 @@ def retrieve(
     def weight(pose: np.ndarray) -> float:
         return 1.0 if likely(pose) else 1.0 / _WEIGHT_OF_PRIOR
 
+    with small.clock.stage("features"):
+        turned = [features.on_host()]
+        if small.components.matcher.upright:
+            turned += [_turned(small, turns) for turns in (1, 2, 3)]
     with small.clock.stage("search"):
-        found = features.on_host()
         weights = np.array([weight(pose) for pose in index.poses])
-        order = np.argsort(-index.rank(found) * weights, kind="stable")
-    group = _Group(small, index, found, order)
-    for view in order[skipped:]:
+        votes = np.array([index.rank(found) * weights for found in turned])
+        groups = [_Group(small, index, *pair) for pair in zip(turned, np.argsort(-votes, kind="stable"), strict=True)]
+    for number in np.argsort(-votes, axis=None, kind="stable")[skipped:].tolist():
+        turns, view = divmod(number, len(index))
         with small.clock.stage("search"):
-            hint = group.hint(view)
+            hint = groups[turns].hint(view)
         if hint is None:
             yield None
         else:
             pose, inliers = hint
             yield Hint(pose, inliers, inliers * weight(pose))
+
+
+def _turned(small: Query, turns: int) -> Features:
+    """Return the features of the photo turned to the left by so many quarters, at the pixels of the photo as it is."""
+    image = small.photo.image
+    found = small.components.matcher.features(np.ascontiguousarray(np.rot90(image, turns))).on_host()
+    x, y = found.keypoints.T
+    right, bottom = image.shape[1] - 1, image.shape[0] - 1
+    x, y = {1: (right - y, x), 2: (right - x, bottom - y), 3: (y, bottom - x)}[turns]
+    return replace(found, keypoints=np.column_stack([x, y]))
 
 
 class _Group:

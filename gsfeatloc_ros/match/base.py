@@ -104,7 +104,13 @@ class Matcher(Protocol[F]):
 
     Images may lie on any device. What `features` returns is for the same matcher's `match`; others look at nothing but
     its length.
+
+    Attributes:
+        upright: whether images match only the same way up, within some 45 degrees.
     """
+
+    @property
+    def upright(self) -> bool: ...
 
     def features(self, image: Array) -> F:
         """Extract the features of an RGB image (H, W, 3) uint8; of an image without any the length is 0."""

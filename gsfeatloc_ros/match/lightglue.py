@@ -49,6 +49,8 @@ class PlacedFeatures(Features):
 class LightGlueMatcher:
     """Local features, matched by LightGlue. It stops early, and drops features on the way, where the match is easy."""
 
+    upright = True
+
     def __init__(
         self,
         extractor: Callable[[str, int, str], Extractor],

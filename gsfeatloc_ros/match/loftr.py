@@ -34,6 +34,8 @@ class DenseFeatures:
 class LoftrMatcher:
     """LoFTR with the weights for outdoor scenes (MegaDepth)."""
 
+    upright = True
+
     def __init__(self, weights: str, max_features: int, device: str) -> None:
         """Load the network.
 

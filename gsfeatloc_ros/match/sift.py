@@ -18,6 +18,8 @@ MAX_DISTANCE_RATIO = 0.85
 class Sift:
     """SIFT features, matched by mutual nearest neighbours and the ratio test. Needs no weights."""
 
+    upright = False
+
     def __init__(self, max_features: int) -> None:
         # Precise upscaling: without it keypoints are a quarter of a pixel off.
         self._sift = cv2.SIFT.create(

@@ -155,6 +155,8 @@ class _Keypoints:
 class GpuSift:
     """SIFT features, matched by mutual nearest neighbours and the ratio test. Needs no weights."""
 
+    upright = False
+
     def __init__(self, max_features: int, device: str) -> None:
         """Prepare constants on `device`, which is torch's; what is found stays there."""
         self._max_features = max_features

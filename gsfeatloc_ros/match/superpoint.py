@@ -31,6 +31,8 @@ _STRIDE = 8
 class SuperPointMatcher:
     """SuperPoint features, matched by a network. Not measured: its weights are not to be had where this was written."""
 
+    upright = True
+
     def __init__(self, network: str, weights: str, max_features: int, device: str) -> None:
         """Load both networks, which are one model of Hugging Face.
 

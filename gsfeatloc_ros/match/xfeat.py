@@ -24,6 +24,8 @@ _WEIGHTS = WeightsSource(
 class XFeatMatcher:
     """XFeat features, matched by mutual nearest neighbours."""
 
+    upright = True
+
     def __init__(self, weights: str, max_features: int, device: str) -> None:
         """Load the network onto a device; `weights` is a path, or "" for the usual places.
 

@@ -73,6 +73,15 @@ def test_random_poses_aim_at_a_point(seed: int, shift: float, scale: float) -> N
         assert aimed_at.any()
 
 
+def test_random_poses_are_nearly_upright() -> None:
+    """But for those that look up or down."""
+    poses, _ = random_poses(CLOUD, 400, np.random.default_rng(0))
+    level = poses[np.abs(poses[:, 2, 2]) < 0.7]
+    assert len(level) > 100
+    assert (level[:, 2, 1] < -0.5).all()  # what is down in the picture
+    assert 0.02 < np.std(level[:, 2, 0]) < 0.2  # what is right in it
+
+
 def test_random_poses_lie_inside_and_around() -> None:
     positions = random_poses(CLOUD, 400, np.random.default_rng(0))[0][:, :3, 3]
     inside = ((positions > CLOUD.min(axis=0)) & (positions < CLOUD.max(axis=0))).all(axis=1)
