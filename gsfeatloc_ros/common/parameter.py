@@ -38,8 +38,17 @@ class Parameter:
     choices: tuple[str, ...] = ()
     live: bool = False
 
+    @property
+    def is_switch(self) -> bool:
+        """Whether true and false are among the choices, which YAML and the command line take for booleans."""
+        return "true" in self.choices
+
+    def as_set(self, value: Value) -> Value:
+        """Return a value as it is in settings: a boolean as the choice of that name."""
+        return str(value).lower() if self.is_switch and isinstance(value, bool) else value
+
     def check(self, value: Value) -> None:
-        """Raise ValueError where `value` is not one of the choices."""
+        """Raise ValueError where `value`, as it is in settings, is not one of the choices."""
         if self.choices and value not in self.choices:
             raise ValueError(f"parameter {self.name}: {value!r} is not one of {', '.join(self.choices)}")
 

@@ -91,7 +91,7 @@ class MeanDepthRenderer:
 
     def __init__(self, renderer: Renderer) -> None:
         self._renderer = renderer
-        self.device, self.solid_points = renderer.device, renderer.solid_points
+        self.device, self.solid_points, self.reading = renderer.device, renderer.solid_points, renderer.reading
 
     def render(self, camera: Camera, T_map_camera: np.ndarray) -> Render:
         """Render the map from the pose `T_map_camera` (4, 4)."""

@@ -69,7 +69,7 @@ def load_renderer(
         raise ValueError("parameter map.path is empty: set it to a map file (-p map.path:=/path/to/map.ply)")
     load = load_prepared if map_.cache else load_map
     return create_renderer(
-        load(map_.path, map_.alignment()),
+        load(map_.path, map_.alignment(), map_.reading),
         renderer.device,
         renderer.threads,
         DrawOptions(background, renderer.sh_degree, renderer.resolution_scale),

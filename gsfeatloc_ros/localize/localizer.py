@@ -31,6 +31,7 @@ from gsfeatloc_ros.localize.options import LocalizerOptions
 from gsfeatloc_ros.localize.prior import Prior
 from gsfeatloc_ros.localize.query import Components, MatchedView, Query
 from gsfeatloc_ros.localize.search import MIN_HINT, SEARCH_WIDTH, Search
+from gsfeatloc_ros.maps.gaussian_map import Reading
 from gsfeatloc_ros.match import Matcher, Tracker, create_tracker
 from gsfeatloc_ros.pose.camera_fit import CameraFit, fit_camera
 from gsfeatloc_ros.pose.solve import Correspondences
@@ -154,7 +155,7 @@ class Localizer:
             rejected = rejected or candidate
         if rejected is not None:
             return rejected.trace(query.photo, search)
-        return _nothing_in_common(query.photo, features, search)
+        return _nothing_in_common(query.photo, features, search, self._components.renderer.reading)
 
     def _best(
         self, query: Query, found: _Candidate, search: Search, prior: Prior | None
@@ -297,19 +298,20 @@ class _Candidate:
         return Trace(estimate, photo, view.render, view.correspondences, changed)
 
 
-def _nothing_in_common(photo: Photo, features: int, search: Search) -> Trace:
-    """None of the views that were searched suggested a pose."""
+def _nothing_in_common(photo: Photo, features: int, search: Search, reading: Reading) -> Trace:
+    """None of the views that were searched suggested a pose; it may be that the map is read wrong."""
     looked = search.looked
+    if search.best is None and not looked:
+        reason = "there is neither a prior nor an index of views in which to look without one (index.build)"
+        return Trace(Estimate(Status.FAILED, reason, evidence=search.counted(Evidence())), photo)
+    other = f". {reading.other}" if reading.other else ""
     if search.best is None:
-        if not looked:
-            reason = "there is neither a prior nor an index of views in which to look without one (index.build)"
-        else:
-            reason = f"none of {looked} suggests a pose: {features} features in the photo"
+        reason = f"none of {looked} suggests a pose: {features} features in the photo{other}"
         return Trace(Estimate(Status.FAILED, reason, evidence=search.counted(Evidence())), photo)
     best = search.best
     evidence = Evidence(matches=best.matches, lifted=len(best.found.pixels), inliers=best.inliers)
     reason = (
         f"photo and renders have nothing in common {looked}: {features} features in the photo, at best {best.matches} "
-        f"matches, {len(best.found.pixels)} with depth, {best.inliers} inliers"
+        f"matches, {len(best.found.pixels)} with depth, {best.inliers} inliers{other}"
     )
     return Trace(Estimate(Status.FAILED, reason, evidence=search.counted(evidence)), photo, best.render)

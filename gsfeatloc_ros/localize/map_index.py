@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -75,10 +76,11 @@ def _usable(path: Path, key: dict[str, Any]) -> ViewIndex | None:
 
 
 def index_key(map_path: str, map_: MapSettings, matcher: MatcherSettings) -> dict[str, Any]:
-    """Return what an index is of: the content of the map, where it lies, and the features; ready for JSON."""
+    """Return what an index is of: the map, how it is read, where it lies, and the features; ready for JSON."""
     placed = map_.alignment()
     return {
         "map": map_content(map_path),
+        "reading": asdict(map_.reading),
         "alignment": np.hstack([placed.scale * placed.rotation, placed.translation[:, None]]).round(9).tolist(),
         "matcher": [matcher.name, matcher.weights],
     }

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from gsfeatloc_ros.common.device import DEVICES
 from gsfeatloc_ros.common.geometry import matrix_from_quaternion
 from gsfeatloc_ros.common.parameter import parameter
-from gsfeatloc_ros.maps import Similarity, read_dataparser_transforms
+from gsfeatloc_ros.maps import ReadOptions, Similarity, read_dataparser_transforms
 from gsfeatloc_ros.match import DEFAULT_MATCHER, DEFAULT_MAX_FEATURES, MATCHERS
 
 
@@ -20,7 +20,8 @@ class MapSettings:
     path: str = parameter(
         "",
         "Path of the map (required): "
-        "a .ply, compressed .ply, .splat, .spz or .sog, or the folder of an unbundled .sog.",
+        "a .ply, compressed .ply, .splat, .spz or .sog, or the folder of an unbundled or streamed .sog, of gsplat's "
+        "PNG images or of the INRIA trainer's output.",
         live=True,
     )
     frame_id: str = parameter("map", "Name of the map's frame, in which answers are given.")
@@ -35,12 +36,13 @@ class MapSettings:
     dataparser_transforms: str = parameter(
         "", "Path of nerfstudio's dataparser_transforms.json, undone before the three above; empty for none."
     )
+    reading: ReadOptions = field(default_factory=ReadOptions)
     cache: bool = parameter(
         True, "Keep the map, prepared for rendering, in a file beside it (*.gsfeatloc-cache): later starts are faster."
     )
 
     def alignment(self) -> Similarity:
-        """Return where the frame of the map's file lies in the robot's map frame (S_map_splat).
+        """Return where the frame of the map's file lies in the robot's map frame.
 
         Raises:
             ValueError: a parameter is no translation, no quaternion or no file of nerfstudio's; the message says which.

@@ -2,61 +2,124 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
+import json
+import zlib
 from pathlib import Path
 
-from gsfeatloc_ros.maps.gaussian_map import GaussianMap, MapError
+from gsfeatloc_ros.maps.assemble import read_packed
+from gsfeatloc_ros.maps.files import find_map
+from gsfeatloc_ros.maps.foreign import (
+    HEAD_BYTES,
+    refuse_foreign,
+    refuse_foreign_folder,
+    refuse_foreign_gzip,
+    refuse_foreign_json,
+    refuse_foreign_zip,
+)
+from gsfeatloc_ros.maps.gaussian_map import GaussianMap, MapError, Reading
+from gsfeatloc_ros.maps.gsplat_png import is_gsplat_png, read_gsplat_png
 from gsfeatloc_ros.maps.nerfstudio import read_dataparser_transforms
+from gsfeatloc_ros.maps.options import ReadOptions
 from gsfeatloc_ros.maps.ply import read_ply
 from gsfeatloc_ros.maps.similarity import Similarity
-from gsfeatloc_ros.maps.sog import read_sog, read_unbundled_sog
+from gsfeatloc_ros.maps.sog import ZIP_ERRORS, read_sog, read_unbundled_sog
 from gsfeatloc_ros.maps.splat import read_splat
 from gsfeatloc_ros.maps.spz import read_spz
+from gsfeatloc_ros.maps.streamed_sog import read_streamed_sog
 
-__all__ = ["GaussianMap", "MapError", "Similarity", "load_map", "read_dataparser_transforms"]
+__all__ = [
+    "GaussianMap",
+    "MapError",
+    "ReadOptions",
+    "Reading",
+    "Similarity",
+    "load_map",
+    "read_dataparser_transforms",
+]
 
-# How the files of each format begin. A .splat begins with its first Gaussian, which may be any bytes, { for example.
-_MAGICS = (
-    (b"ply", read_ply),
-    (b"NGSP", read_spz),
-    (b"\x1f\x8b\x08", read_spz),
-    (b"PK\x03\x04", read_sog),
-    (b"PK\x05\x06", read_sog),  # an empty one
-)
-_MAX_HEAD_BYTES = 64
+_DEFAULT_OPTIONS = ReadOptions()
+# The tree of a streamed .sog takes more than all else.
+_MAX_JSON_BYTES = 1 << 26
 
 
-def load_map(path: str | Path, alignment: Similarity | None = None) -> GaussianMap:
+def load_map(
+    path: str | Path, alignment: Similarity | None = None, options: ReadOptions = _DEFAULT_OPTIONS
+) -> GaussianMap:
     """Read a 3D Gaussian Splatting map; its format is told by what the file holds, not by its name.
 
     Args:
         path: a .ply in the layout of the INRIA trainer, gsplat and nerfstudio; a compressed .ply of PlayCanvas; a
-            .splat; an .spz; a .sog, or the folder or meta.json of an unbundled one.
-        alignment: the map's S_map_splat; without it the map's frame is the robot's.
+            .splat; an .spz; a .sog, or the folder or meta.json of an unbundled one or of gsplat's PngCompression; the
+            folder or lod-meta.json of a streamed .sog; the output folder of the INRIA trainer.
+        alignment: where the frame of the file lies in the robot's map frame; without it that is the robot's.
+        options: what the file may leave open.
 
     Raises:
         MapError: the file cannot be used; the message names it, what is wrong and what to do.
     """
     path = Path(path)
     try:
-        gaussian_map = _reader(path)(path)
+        found = find_map(path)
+        gaussian_map = _read(found, options)
     except OSError as error:
         raise MapError(f"{path}: cannot be read: {error.strerror or error}") from error
     except MemoryError as error:
         raise MapError(f"{path}: does not fit into this machine's memory: crop or thin the map") from error
-    return gaussian_map if alignment is None else replace(gaussian_map, S_map_splat=alignment)
-
-
-def _reader(path: Path) -> Callable[[Path], GaussianMap]:
     if path.is_dir():
-        return read_unbundled_sog
+        gaussian_map = gaussian_map.with_note(f"of the folder, {found.relative_to(path)} is read")
+    return gaussian_map if alignment is None else gaussian_map.placed(alignment)
+
+
+def _read(path: Path, options: ReadOptions) -> GaussianMap:
+    if path.is_dir():
+        refuse_foreign_folder(path)
     if path.exists() and not path.is_file():  # opening a pipe would wait for its writer
         raise MapError(f"{path}: is not a file")
     with path.open("rb") as stream:
-        head = stream.read(_MAX_HEAD_BYTES)
+        head = stream.read(HEAD_BYTES)
     if not head:
         raise MapError(f"{path}: is an empty file")
+    # A .splat begins with its first Gaussian, which may be any bytes, { for example.
+    if head.startswith(b"ply"):
+        return read_ply(path, options)
+    if head.startswith(b"NGSP"):
+        return read_spz(path, options)
+    if head.startswith(b"\x1f\x8b\x08"):
+        return _read_gzip(path, head, options)
+    if head.startswith((b"PK\x03\x04", b"PK\x05\x06")):  # the latter is an empty zip
+        return _read_zip(path, options)
     if head.startswith(b"{") and head.isascii() and b"\0" not in head:
-        return read_unbundled_sog
-    return next((reader for magic, reader in _MAGICS if head.startswith(magic)), read_splat)
+        return _read_json(path, options)
+    refuse_foreign(path, head)
+    return read_splat(path, options)
+
+
+def _read_gzip(path: Path, head: bytes, options: ReadOptions) -> GaussianMap:
+    try:
+        beginning = zlib.decompressobj(16 + zlib.MAX_WBITS).decompress(head, 16)
+    except zlib.error as error:
+        raise MapError(f"{path}: is a damaged gzip: {error}") from error
+    if beginning and not b"NGSP".startswith(beginning[:4]):
+        refuse_foreign_gzip(path, beginning)
+    return read_spz(path, options)
+
+
+def _read_zip(path: Path, options: ReadOptions) -> GaussianMap:
+    try:
+        refuse_foreign_zip(path)
+    except ZIP_ERRORS as error:
+        raise MapError(f"{path}: is a truncated or damaged zip: {error}") from error
+    return read_sog(path, options)
+
+
+def _read_json(path: Path, options: ReadOptions) -> GaussianMap:
+    try:
+        meta = json.loads(read_packed(path, path, _MAX_JSON_BYTES))
+    except (ValueError, RecursionError) as error:
+        raise MapError(f"{path}: is a damaged JSON file: {error}") from error
+    if isinstance(meta, dict) and {"lodLevels", "tree"} <= set(meta):
+        return read_streamed_sog(path, meta, options)
+    if is_gsplat_png(meta):
+        return read_gsplat_png(path, meta, options)
+    refuse_foreign_json(path, meta)
+    return read_unbundled_sog(path, options)

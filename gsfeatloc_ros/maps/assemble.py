@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from gsfeatloc_ros.maps.gaussian_map import GaussianMap, MapError
+from gsfeatloc_ros.maps.gaussian_map import GaussianMap, MapError, Reading
+from gsfeatloc_ros.maps.options import ReadOptions
+from gsfeatloc_ros.maps.similarity import Similarity
 
 # Constant harmonic of the sphere: colour = 0.5 + SH_C0 * its coefficient.
 SH_C0 = 0.28209479177387814
@@ -21,15 +24,45 @@ MAX_PACKED_BYTES = 65 * MAX_GAUSSIANS
 # Packed Gaussians compress to a half or a third. What claims to unpack to so many times its size is no map.
 MAX_COMPRESSION_RATIO = 100
 
+_ARRAYS = ("means", "scales", "rotations", "opacities", "sh")
+# With a larger share of rows that hold no Gaussian, a file is damaged or not what it seems.
+_MAX_INVALID_SHARE = 0.01
+# Farther from the origin than this (splat units), float32 renders would shake: its steps are 6e-5 there.
+_MAX_DISTANCE = 1000.0
+# Positions known no better than to this many splat units are worth a word.
+_COARSE_STEP = 1e-3
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What the header of a file says.
+
+    Attributes:
+        count: number of Gaussians.
+        sh_coefficients: number of spherical harmonics per colour channel that are read.
+        antialiased: as in GaussianMap; None where the file says nothing of it.
+        notes, other: as in Reading.
+    """
+
+    count: int
+    sh_coefficients: int
+    antialiased: bool | None = None
+    notes: tuple[str, ...] = ()
+    other: str = ""
+
 
 class Block(NamedTuple):
-    """A run of a map's Gaussians, as in GaussianMap but unchecked: quaternions of any norm, any values."""
+    """A run of a map's Gaussians, as in GaussianMap but unchecked: quaternions of any norm, any values.
 
-    means: np.ndarray  # (n, 3)
+    `step` (n,) is how finely the file tells positions, where single precision limits that; 0 elsewhere.
+    """
+
+    means: np.ndarray  # (n, 3), float64 where the file's are
     scales: np.ndarray  # (n, 3)
     rotations: np.ndarray  # (n, 4) wxyz
     opacities: np.ndarray  # (n,)
     sh: np.ndarray  # (n, C, 3)
+    step: np.ndarray | float = 0.0
 
 
 def check_count(path: Path, count: int) -> None:
@@ -60,14 +93,23 @@ def block_slices(count: int) -> Iterator[slice]:
         yield slice(start, min(start + MAX_BLOCK_ROWS, count))
 
 
-def assemble(
-    path: Path, count: int, sh_coefficients: int, blocks: Iterable[Block], antialiased: bool = False
-) -> GaussianMap:
-    """Gather `blocks`, which together hold `count` Gaussians, into a map.
+def single_precision_step(means: np.ndarray) -> np.ndarray:
+    """Return how far apart (n,) the numbers of the type of the positions (n, 3) are there, along the coarsest axis."""
+    return np.spacing(np.abs(means).max(axis=1))
+
+
+def assemble(path: Path, layout: Layout, blocks: Iterable[Block], options: ReadOptions) -> GaussianMap:
+    """Gather `blocks`, which together hold as many Gaussians as the layout says, into a map.
+
+    Rows with values that are not finite in float32, and with quaternions of zero length, are left out. Of a map far
+    from its file's origin, as georeferenced ones are, an offset is taken off before its positions become float32; it is
+    in S_map_splat.
 
     Raises:
-        MapError: a value is not finite in float32, or a quaternion is of zero length.
+        MapError: more than 1 % of the rows would be left out, or positions are coarser than the Gaussians.
     """
+    count, sh_coefficients = layout.count, layout.sh_coefficients
+    antialiased, antialiased_notes = _antialiased(layout, options)
     gaussian_map = GaussianMap(
         means=np.empty((count, 3), np.float32),
         scales=np.empty((count, 3), np.float32),
@@ -76,30 +118,107 @@ def assemble(
         sh=np.empty((count, sh_coefficients, 3), np.float32),
         antialiased=antialiased,
     )
-    invalid, first_invalid, start = 0, 0, 0
-    # What does not fit into float32 becomes infinite and is refused by its value.
+    offset: np.ndarray | None = None
+    read, kept, first_invalid, steps = 0, 0, 0, _Steps()
+    # What does not fit into float32 becomes infinite and is left out by its value.
     with np.errstate(over="ignore", invalid="ignore"):
         for block in blocks:
-            rows = slice(start, start + len(block.means))
-            finite = np.ones(len(block.means), dtype=bool)
-            for name, values in block._asdict().items():
-                stored = getattr(gaussian_map, name)[rows]
-                stored[...] = values
-                finite &= np.isfinite(stored).all(axis=tuple(range(1, stored.ndim)))
-            # A Gaussian may be flatter than float32 can say, never of no extent.
-            scales = gaussian_map.scales[rows]
-            np.maximum(scales, np.finfo(np.float32).tiny, out=scales)
-            rotations = gaussian_map.rotations[rows]
-            norms = np.linalg.norm(rotations.astype(np.float64), axis=1)
-            finite &= norms > 0
-            rotations /= np.where(norms > 0, norms, 1.0)[:, None]
-            if not finite.all():
-                first_invalid = first_invalid if invalid else start + int(finite.argmin())
-                invalid += int(np.count_nonzero(~finite))
-            start = rows.stop
+            if offset is None:
+                offset = _offset(block.means)
+            valid = _store(gaussian_map, kept, block, offset)
+            first_invalid = read + int(valid.argmin()) if kept == read and not valid.all() else first_invalid
+            stored = int(np.count_nonzero(valid))
+            steps.take(block, gaussian_map.scales[kept : kept + stored], valid)
+            read, kept = read + len(valid), kept + stored
+    invalid = read - kept
     if invalid:
-        raise MapError(
-            f"{path}: {invalid} of {count} Gaussians have values that are NaN, infinite or too large, or a rotation "
-            f"quaternion of zero length, the first is number {first_invalid}"
+        what = (
+            f"{invalid} of {count} Gaussians have values that are NaN, infinite or too large, or a rotation quaternion "
+            f"of zero length, the first is number {first_invalid}"
         )
-    return gaussian_map
+        if invalid > _MAX_INVALID_SHARE * count:
+            raise MapError(f"{path}: {what}; up to {_MAX_INVALID_SHARE:.0%} of such would be left out")
+        arrays = {name: getattr(gaussian_map, name)[:kept] for name in _ARRAYS}
+        gaussian_map = replace(gaussian_map, **arrays)
+    steps.check(path, kept)
+    notes = [*layout.notes, *antialiased_notes, *steps.notes(kept)]
+    notes += [f"{what}: left out"] if invalid else []
+    return replace(
+        gaussian_map,
+        S_map_splat=Similarity(translation=np.zeros(3) if offset is None else offset),
+        reading=Reading(tuple(notes), invalid, layout.other),
+    )
+
+
+def _antialiased(layout: Layout, options: ReadOptions) -> tuple[bool, list[str]]:
+    """Return whether to draw antialiased, and what there is to say of that."""
+    if options.antialiased == "auto":
+        if layout.antialiased is None:
+            return False, ["whether it was trained antialiased the file does not say: drawn as not (map.antialiased)"]
+        return layout.antialiased, []
+    chosen = options.antialiased == "true"
+    if layout.antialiased not in (None, chosen):
+        return chosen, [f"map.antialiased is {options.antialiased}, though the file says otherwise"]
+    return chosen, []
+
+
+def _offset(means: np.ndarray) -> np.ndarray:
+    """Return whole numbers (3,) float64 to take off all positions, by some (n, 3) of them; zeros near the origin."""
+    finite = means[np.isfinite(means).all(axis=1)].astype(np.float64)
+    if not len(finite):
+        return np.zeros(3)
+    offset = np.round(np.median(finite, axis=0))
+    return offset if np.abs(offset).max() > _MAX_DISTANCE else np.zeros(3)
+
+
+def _store(gaussian_map: GaussianMap, start: int, block: Block, offset: np.ndarray) -> np.ndarray:
+    """Put the valid Gaussians of a block into a map's arrays from row `start` on; return which (n,) bool are valid."""
+    rows = slice(start, start + len(block.means))
+    valid = np.ones(len(block.means), dtype=bool)
+    placed = block._replace(means=block.means - offset) if offset.any() else block
+    for name in _ARRAYS:
+        stored = getattr(gaussian_map, name)[rows]
+        stored[...] = getattr(placed, name)
+        valid &= np.isfinite(stored).all(axis=tuple(range(1, stored.ndim)))
+    # A Gaussian may be flatter than float32 can say, never of no extent.
+    scales = gaussian_map.scales[rows]
+    np.maximum(scales, np.finfo(np.float32).tiny, out=scales)
+    rotations = gaussian_map.rotations[rows]
+    norms = np.linalg.norm(rotations.astype(np.float64), axis=1)
+    valid &= norms > 0
+    rotations /= np.where(norms > 0, norms, 1.0)[:, None]
+    if not valid.all():
+        for name in _ARRAYS:
+            stored = getattr(gaussian_map, name)[rows]
+            stored[: np.count_nonzero(valid)] = stored[valid]
+    return valid
+
+
+class _Steps:
+    """Whether single precision tells positions as finely as the Gaussians are small, and as it should."""
+
+    def __init__(self) -> None:
+        self._too_coarse = self._coarse = 0
+        self._largest = 0.0
+
+    def take(self, block: Block, scales: np.ndarray, valid: np.ndarray) -> None:
+        """Look at the `valid` Gaussians of a block, whose scales are (m, 3)."""
+        step = np.broadcast_to(block.step, len(valid))[valid]
+        self._too_coarse += int(np.count_nonzero(step > scales.max(axis=1, initial=0.0)))
+        self._coarse += int(np.count_nonzero(step > _COARSE_STEP))
+        self._largest = max(self._largest, float(step.max(initial=0.0)))
+
+    def check(self, path: Path, count: int) -> None:
+        """Raise MapError where most of `count` Gaussians are smaller than the steps of their positions."""
+        if self._too_coarse > 0.5 * count:
+            raise MapError(
+                f"{path}: its positions are so far from the origin that single precision tells them to "
+                f"{self._largest:.2g} units only, more than most of its Gaussians are large: export it in double "
+                f"precision, or train and export it near the origin, and set map.translation"
+            )
+
+    def notes(self, count: int) -> list[str]:
+        """Return what there is to say of the precision of `count` Gaussians."""
+        if self._coarse <= 0.5 * count:
+            return []
+        return [f"far from the origin, single precision tells the positions to {self._largest:.2g} units only"]

@@ -10,7 +10,7 @@ from itertools import repeat
 
 import numpy as np
 
-from gsfeatloc_ros.maps.assemble import SH_C0, Block
+from gsfeatloc_ros.maps.assemble import SH_C0, Block, single_precision_step
 from gsfeatloc_ros.maps.gaussian_map import SH_COEFFICIENTS, MapError
 from gsfeatloc_ros.maps.ply_file import PlyFile, check_no_lists, columns
 
@@ -55,7 +55,11 @@ def check_layout(ply: PlyFile) -> int:
 def blocks(ply: PlyFile, coefficients: int) -> Iterator[Block]:
     """Yield runs of Gaussians, unpacked."""
     chunks = np.concatenate(list(ply.blocks("chunk")))
-    low, high, low_scale, high_scale = (columns(chunks, names) for names in _BOUNDS)
+    (low, high), (low_scale, high_scale) = (
+        [columns(chunks, names, dtype) for names in bounds]
+        for bounds, dtype in ((_BOUNDS[:2], np.float64), (_BOUNDS[2:], np.float32))
+    )
+    double = all(chunks.dtype[name] == np.float64 for names in _BOUNDS[:2] for name in names)
     if all(name in ply["chunk"] for names in _COLOR_BOUNDS for name in names):
         low_color, high_color = (columns(chunks, names) for names in _COLOR_BOUNDS)
     else:
@@ -75,12 +79,14 @@ def blocks(ply: PlyFile, coefficients: int) -> Iterator[Block]:
 
         colors = _unpack(rows["packed_color"], (8, 8, 8, 8))
         sh0 = (between(low_color, high_color, colors[:, :3]) - 0.5) / SH_C0
+        means = between(low, high, _unpack(rows["packed_position"], (11, 10, 11)))
         yield Block(
-            means=between(low, high, _unpack(rows["packed_position"], (11, 10, 11))),
+            means=means,
             scales=np.exp(between(low_scale, high_scale, _unpack(rows["packed_scale"], (11, 10, 11)))),
             rotations=_unpack_rotations(rows["packed_rotation"]),
             opacities=colors[:, 3],
             sh=sh0[:, None] if rest is None else np.concatenate([sh0[:, None], _unpack_harmonics(rest)], axis=1),
+            step=0.0 if double else single_precision_step(means.astype(np.float32)),
         )
 
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from gsfeatloc_ros.maps.similarity import Similarity
 
-# Numbers of spherical-harmonics coefficients per colour channel for degrees 0 to 3.
+# Numbers of spherical-harmonics coefficients per colour channel for degrees 0 to 3; those of higher ones are not read.
 SH_COEFFICIENTS = (1, 4, 9, 16)
 
 
@@ -18,6 +18,22 @@ class MapError(ValueError):
 
 # Gaussians that cover more than this are what is there; others may be haze.
 SOLID_OPACITY = 0.5
+
+
+@dataclass(frozen=True)
+class Reading:
+    """What there is to say of how a map's file was read.
+
+    Attributes:
+        notes: whole sentences: what was left out, assumed, or is in the file and not used.
+        left_out: number of rows of the file that hold no Gaussian.
+        other: how else the file may be meant, and what to set then, for photos that have nothing in common with the
+            map; empty where there is no doubt.
+    """
+
+    notes: tuple[str, ...] = ()
+    left_out: int = 0
+    other: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,6 +50,7 @@ class GaussianMap:
         antialiased: trained with the filter of Mip-Splatting: a Gaussian that the 2D blur widens is dimmed as much.
         S_map_splat: where the frame that the Gaussians were trained in lies in the robot's map frame. Renderers move
             the camera by it, for spherical harmonics do not turn for free.
+        reading: what there is to say of how its file was read.
     """
 
     means: np.ndarray
@@ -43,9 +60,18 @@ class GaussianMap:
     sh: np.ndarray
     antialiased: bool = False
     S_map_splat: Similarity = field(default_factory=Similarity)
+    reading: Reading = field(default_factory=Reading)
 
     def __len__(self) -> int:
         return len(self.means)
+
+    def with_note(self, note: str) -> GaussianMap:
+        """Return the same with one more thing to say of how its file was read."""
+        return replace(self, reading=replace(self.reading, notes=(note, *self.reading.notes)))
+
+    def placed(self, S_map_file: Similarity) -> GaussianMap:
+        """Return the same where the frame of its file lies elsewhere in the robot's map frame."""
+        return replace(self, S_map_splat=S_map_file @ self.S_map_splat)
 
     def solid_points(self, count: int) -> np.ndarray:
         """Return the centres (n, 3) float32, splat frame, of up to `count` Gaussians that cover more than a half."""

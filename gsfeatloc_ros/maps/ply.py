@@ -1,7 +1,8 @@
-"""Maps in the .ply layout of the INRIA trainer, gsplat and nerfstudio."""
+"""Maps in the .ply layout of the INRIA trainer, gsplat and nerfstudio, and what others add to it."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -9,42 +10,61 @@ import numpy as np
 from plyfile import PlyData, PlyElement
 
 from gsfeatloc_ros.maps import compressed_ply
-from gsfeatloc_ros.maps.assemble import Block, assemble, check_count
+from gsfeatloc_ros.maps.assemble import SH_C0, Block, Layout, assemble, check_count, single_precision_step
 from gsfeatloc_ros.maps.gaussian_map import SH_COEFFICIENTS, GaussianMap, MapError
+from gsfeatloc_ros.maps.options import ReadOptions
 from gsfeatloc_ros.maps.ply_file import PlyFile, check_no_lists, columns
 
 _MEANS = ["x", "y", "z"]
 _NORMALS = ["nx", "ny", "nz"]
 _SH_DC = ["f_dc_0", "f_dc_1", "f_dc_2"]
+_RGB = ["red", "green", "blue"]
 _OPACITY = ["opacity"]
 _SCALES = ["scale_0", "scale_1", "scale_2"]
 _ROTATIONS = ["rot_0", "rot_1", "rot_2", "rot_3"]
+# Of Mip-Splatting and Gaussian Opacity Fields: how wide, in splat units, a Gaussian is at least to be drawn.
+_FILTER = "filter_3D"
 
+# Properties that only maps of other primitives have, by name or, with a _ at the end, by how they begin.
+_OTHER_PRIMITIVES = {
+    "f_offset_": "a Scaffold-GS or Octree-GS map, whose Gaussians are made by networks that are not in it",
+    "f_anchor_feat_": "a Scaffold-GS or Octree-GS map, whose Gaussians are made by networks that are not in it",
+    "trbf_": "a map of moving Gaussians (Spacetime Gaussians)",
+    "motion_": "a map of moving Gaussians (Spacetime Gaussians)",
+    "omega_": "a map of moving Gaussians (Spacetime Gaussians)",
+    "scale_t": "a map of 4D Gaussians",
+    "rot_r_": "a map of 4D Gaussians",
+    "beta": "a Deformable Beta Splatting map",
+    "shape": "a GES map, of generalized exponentials",
+    "nu_degree": "a Student-t splatting map",
+}
+_EXPORT = "export it as 3D Gaussians, in the layout of the INRIA trainer"
 # Keeps the logit of an opacity finite when it is written.
 _MIN_OPACITY = 1e-7
 
 
-def read_ply(path: Path) -> GaussianMap:
-    """Read a map from a .ply file: ascii or binary, float or double, properties in any order, SH degree 0 to 3.
+def read_ply(path: Path, options: ReadOptions) -> GaussianMap:
+    """Read a map from a .ply file: ascii or binary, float or double, properties in any order, of any SH degree.
 
     PlayCanvas's compressed .ply is read as well.
 
     Raises:
-        MapError: the file is no .ply, truncated, of another layout, empty or holds invalid values.
+        MapError: the file is no .ply, truncated, of another layout, empty or holds too many invalid values.
         OSError: it cannot be read.
     """
     ply = PlyFile(path)
     if "vertex" not in ply:
         raise MapError(f"{path}: has no element 'vertex', so no Gaussians")
-    antialiased = _antialiased(ply)
     vertex = ply["vertex"]
     check_no_lists(ply, vertex)
     check_count(path, vertex.count)
-    if "packed_position" in vertex:
-        coefficients = compressed_ply.check_layout(ply)
-        return assemble(path, vertex.count, coefficients, compressed_ply.blocks(ply, coefficients), antialiased)
-    coefficients = _check_layout(ply)
-    return assemble(path, vertex.count, coefficients, _blocks(ply, coefficients), antialiased)
+    compressed = "packed_position" in vertex
+    coefficients = compressed_ply.check_layout(ply) if compressed else _check_layout(ply)
+    used = min(coefficients, SH_COEFFICIENTS[-1])
+    unused = [] if compressed else _unused(ply, coefficients)
+    layout = Layout(vertex.count, used, _antialiased(ply), tuple(unused + _remarks(ply, compressed)))
+    blocks = compressed_ply.blocks(ply, coefficients) if compressed else _blocks(ply, coefficients)
+    return assemble(path, layout, blocks, options)
 
 
 def write_ply(path: str | Path, gaussian_map: GaussianMap) -> None:
@@ -72,15 +92,17 @@ def write_ply(path: str | Path, gaussian_map: GaussianMap) -> None:
     PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<", comments=comments).write(str(path))
 
 
-def _antialiased(ply: PlyFile) -> bool:
+def _antialiased(ply: PlyFile) -> bool | None:
     """Return whether a comment of Brush or Postshot says that the map was trained antialiased; the last one counts."""
-    antialiased = False
+    antialiased: bool | None = None
     for comment in ply.comments:
         match comment.lower().split():
             case ["splatrendermode:", "2dgs"]:
                 raise MapError(f"{ply.path}: is a 2D Gaussian splatting (2DGS) map; only 3D ones are read")
             case ["splatrendermode:", ("mip" | "default") as mode]:
                 antialiased = mode == "mip"
+            case ["splatrendermode:", *mode]:
+                raise MapError(f"{ply.path}: is to be rendered in a mode that is not known: {' '.join(mode)}")
             case ["antialiased", ("0" | "1") as flag]:
                 antialiased = flag == "1"
             case [("postshot.anti_aliasing=0" | "postshot.anti_aliasing=1") as flag]:
@@ -88,43 +110,120 @@ def _antialiased(ply: PlyFile) -> bool:
     return antialiased
 
 
+def _remarks(ply: PlyFile, compressed: bool) -> list[str]:
+    """Return what there is to say of a header beyond the properties of its Gaussians."""
+    known = {"vertex", "chunk", "sh"} if compressed else {"vertex"}
+    notes = []
+    if others := [name for name in ply.elements if name not in known]:
+        notes.append(f"elements that are not used: {', '.join(others)}")
+    if ply.trailing_bytes:
+        notes.append(f"{ply.trailing_bytes} bytes behind the data are not used")
+    for comment in ply.comments:
+        # Brush writes where up is in the data; the Gaussians stay in the frame of their photos.
+        if comment.lower().startswith("vertical axis:"):
+            notes.append(f"the file says {comment!r}: turn it by map.rotation if the robot's up is another")
+    return notes
+
+
+def _unused(ply: PlyFile, coefficients: int) -> list[str]:
+    """Return what there is to say of properties that are not those of the INRIA layout."""
+    vertex = ply["vertex"]
+    known = {*_MEANS, *_NORMALS, *_SH_DC, *_OPACITY, *_SCALES, *_ROTATIONS, _FILTER}
+    known |= set() if _SH_DC[0] in vertex else set(_RGB)
+    names = [p.name for p in vertex.properties if p.name not in known and not p.name.startswith("f_rest_")]
+    notes = [f"properties that are not used: {', '.join(names)}"] if names else []
+    if _FILTER in vertex:
+        notes.append(f"{_FILTER} of Mip-Splatting or GOF is taken into scales and opacities")
+    if _SH_DC[0] not in vertex:
+        notes.append("colours are RGB, the same from all sides")
+    if coefficients > SH_COEFFICIENTS[-1]:
+        notes.append(f"spherical harmonics of degree {math.isqrt(coefficients) - 1} are read to degree 3")
+    return notes
+
+
 def _check_layout(ply: PlyFile) -> int:
     """Refuse a header that is not that of a Gaussian splatting map; return its SH coefficients per channel."""
     vertex = ply["vertex"]
-    required = _MEANS + _SH_DC + _OPACITY + _SCALES + _ROTATIONS
-    missing = [name for name in required if name not in vertex]
-    if missing == ["scale_2"]:
-        raise MapError(f"{ply.path}: has no scale_2: this is a 2D Gaussian splatting (2DGS) map; only 3D ones are read")
-    if missing == _SH_DC:
-        raise MapError(f"{ply.path}: lacks {', '.join(missing)}: export the colours as spherical harmonics, not as RGB")
+    _check_primitives(ply)
+    colors = _SH_DC if _SH_DC[0] in vertex or not _is_rgb(vertex) else _RGB
+    missing = [name for name in [*_MEANS, *colors, *_OPACITY, *_SCALES, *_ROTATIONS] if name not in vertex]
+    if missing == _SH_DC and _RGB[0] in vertex:
+        raise MapError(f"{ply.path}: has colours that are no bytes: export them as spherical harmonics or 8-bit RGB")
     if missing:
-        hint = ": is it a mesh or a point cloud?" if "opacity" in missing else ""
-        raise MapError(f"{ply.path}: lacks {', '.join(missing)} of a Gaussian splatting map{hint}")
+        raise MapError(f"{ply.path}: lacks {', '.join(missing)} of a Gaussian splatting map")
     rest = {p.name for p in vertex.properties if p.name.startswith("f_rest_")}
     coefficients = 1 + len(rest) // 3
-    if coefficients not in SH_COEFFICIENTS or rest != {f"f_rest_{index}" for index in range(3 * (coefficients - 1))}:
+    if (
+        math.isqrt(coefficients) ** 2 != coefficients
+        or rest != {f"f_rest_{index}" for index in range(3 * (coefficients - 1))}
+        or (rest and colors is _RGB)
+    ):
         raise MapError(
-            f"{ply.path}: has {len(rest)} f_rest properties; spherical harmonics of degree 0 to 3 take f_rest_0 up to "
-            f"a number of 0, 9, 24 or 45"
+            f"{ply.path}: has {len(rest)} f_rest properties; spherical harmonics of degree 0 to 4 have f_dc_0 to "
+            f"f_dc_2 and f_rest_0 up to a number of 0, 9, 24, 45 or 72"
         )
     return coefficients
 
 
+def _check_primitives(ply: PlyFile) -> None:
+    """Refuse by its name what is no 3D Gaussian splatting map."""
+    names = [p.name for p in ply["vertex"].properties]
+    for other, what in _OTHER_PRIMITIVES.items():
+        if any(name == other or (other.endswith("_") and name.startswith(other)) for name in names):
+            raise MapError(f"{ply.path}: is {what}: {_EXPORT}")
+    if "scale_1" in names and "scale_2" not in names:
+        raise MapError(f"{ply.path}: has no scale_2: this is a 2D Gaussian splatting (2DGS) map; only 3D ones are read")
+    if "scalar_opacity" in names or "scalar_scale_0" in names:
+        raise MapError(
+            f"{ply.path}: was saved by CloudCompare, which renames the properties of Gaussians to scalar_... and does "
+            f"not turn or scale them with the points: crop and move the map with SuperSplat or splat-transform"
+        )
+    if not {*_OPACITY, *_SCALES, *_ROTATIONS} & set(names):
+        kind = "mesh" if "face" in ply.elements else "point cloud"
+        raise MapError(f"{ply.path}: is a {kind} without Gaussians: train a Gaussian splatting map, and name its .ply")
+
+
+def _is_rgb(vertex: PlyElement) -> bool:
+    """Return whether the vertices have colours as bytes."""
+    return all(name in vertex and np.dtype(vertex.dtype())[name] == np.uint8 for name in _RGB)
+
+
 def _blocks(ply: PlyFile, coefficients: int) -> Iterator[Block]:
     """Yield runs of Gaussians, activated: exp of log scales, sigmoid of opacity logits."""
+    vertex = ply["vertex"]
     # The file holds all harmonics of red, then of green, then of blue.
     count = coefficients - 1
-    rest = [f"f_rest_{channel * count + index}" for index in range(count) for channel in range(3)]
+    used = min(coefficients, SH_COEFFICIENTS[-1]) - 1
+    rest = [f"f_rest_{channel * count + index}" for index in range(used) for channel in range(3)]
+    double = all(np.dtype(vertex.dtype())[name] == np.float64 for name in _MEANS)
     for rows in ply.blocks("vertex"):
+        means = columns(rows, _MEANS, np.float64 if double else np.float32)
+        if _SH_DC[0] in vertex:
+            sh = columns(rows, [*_SH_DC, *rest])
+        else:
+            sh = (columns(rows, _RGB) / np.float32(255.0) - np.float32(0.5)) / np.float32(SH_C0)
+        scales, opacities = _activated(rows, _FILTER in vertex)
         yield Block(
-            means=columns(rows, _MEANS),
-            scales=np.exp(_nan_if_infinite(columns(rows, _SCALES))),
+            means=means,
+            scales=scales,
             rotations=columns(rows, _ROTATIONS),
-            opacities=1.0 / (1.0 + np.exp(-_nan_if_infinite(columns(rows, _OPACITY)[:, 0]))),
-            sh=columns(rows, [*_SH_DC, *rest]).reshape(len(rows), -1, 3),
+            opacities=opacities,
+            sh=sh.reshape(len(rows), -1, 3),
+            step=0.0 if double else single_precision_step(means),
         )
 
 
-def _nan_if_infinite(values: np.ndarray) -> np.ndarray:
-    """Return the values, with NaN for the infinite ones, which would become 0 or 1 and pass for valid."""
-    return np.where(np.isfinite(values), values, np.float32(np.nan))
+def _activated(rows: np.ndarray, filtered: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Return scales (n, 3) and opacities (n,); a logarithm or logit of minus infinity gives 0, a logit of infinity 1.
+
+    With the filter, as Mip-Splatting draws them (Yu et al., 2024, eq. 7): a Gaussian is wider, and dimmed as much.
+    """
+    scales = np.exp(columns(rows, _SCALES))
+    opacities = 1.0 / (1.0 + np.exp(-columns(rows, _OPACITY)[:, 0]))
+    if not filtered:
+        return scales, opacities
+    # In double precision: the product of three squares of small scales is less than float32 can say.
+    squares = scales.astype(np.float64) ** 2
+    wider = squares + columns(rows, [_FILTER]).astype(np.float64) ** 2
+    shares = np.divide(squares, wider, out=np.ones_like(wider), where=wider != 0)
+    return np.sqrt(wider), opacities * np.sqrt(np.prod(shares, axis=1))

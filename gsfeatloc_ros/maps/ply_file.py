@@ -22,8 +22,12 @@ class PlyFile:
 
     The numbers that the header declares are checked against the file's size before any memory is taken for them.
 
+    Attributes:
+        path: of the file.
+        trailing_bytes: number of bytes behind what a binary file's header declares; 0 where lists hide where that ends.
+
     Raises:
-        MapError: the file is no .ply, is truncated or holds more than its header declares.
+        MapError: the file is no .ply or is truncated.
         OSError: it cannot be read.
     """
 
@@ -37,7 +41,7 @@ class PlyFile:
         except (PlyParseError, ValueError) as error:
             raise MapError(f"{path}: has no valid .ply header: {error}") from error
         self._data_start = head.tell()
-        self._check_size(path.stat().st_size - self._data_start)
+        self.trailing_bytes = self._check_size(path.stat().st_size - self._data_start)
 
     def __contains__(self, name: str) -> bool:
         return name in self._header
@@ -45,6 +49,11 @@ class PlyFile:
     def __getitem__(self, name: str) -> PlyElement:
         """Return the element called `name`, of which only what the header says of it is there."""
         return self._header[name]
+
+    @property
+    def elements(self) -> list[str]:
+        """Names of the elements that have rows."""
+        return [element.name for element in self._header if element.count]
 
     @property
     def comments(self) -> list[str]:
@@ -58,7 +67,8 @@ class PlyFile:
         read = self._read_ascii if self._header.text else self._read_binary
         return read(element, before)
 
-    def _check_size(self, data_size: int) -> None:
+    def _check_size(self, data_size: int) -> int:
+        """Refuse a header that declares more than `data_size` bytes of data; return how many there are beyond these."""
         header = self._header
         if any(element.count < 0 for element in header):
             raise MapError(f"{self.path}: declares a negative number of elements")
@@ -70,9 +80,9 @@ class PlyFile:
             fixed = [element for element in header if not _lists(element)]
             declared = sum(element.count * element.dtype(header.byte_order).itemsize for element in fixed)
             exact = len(fixed) == len(header)
-        if data_size < declared or (exact and data_size > declared):
-            state = "truncated" if data_size < declared else "damaged"
-            raise MapError(f"{self.path}: is {state}: the header declares {declared} bytes of data, not {data_size}")
+        if data_size < declared:
+            raise MapError(f"{self.path}: is truncated: the header declares {declared} bytes of data, not {data_size}")
+        return data_size - declared if exact else 0
 
     def _read_binary(self, element: PlyElement, before: list[PlyElement]) -> Iterator[np.ndarray]:
         offset = self._data_start
@@ -111,9 +121,9 @@ def check_no_lists(ply: PlyFile, element: PlyElement) -> None:
         raise MapError(f"{ply.path}: element '{element.name}' has list properties ({', '.join(names)}); a map has none")
 
 
-def columns(rows: np.ndarray, names: list[str]) -> np.ndarray:
-    """Copy the named fields of the rows (n,) into an array (n, len(names)) float32."""
-    out = np.empty((len(rows), len(names)), dtype=np.float32)
+def columns(rows: np.ndarray, names: list[str], dtype: np.dtype | type = np.float32) -> np.ndarray:
+    """Copy the named fields of the rows (n,) into an array (n, len(names))."""
+    out = np.empty((len(rows), len(names)), dtype=dtype)
     with np.errstate(over="ignore", invalid="ignore"):  # what does not fit is refused by its value
         for index, name in enumerate(names):
             out[:, index] = rows[name]

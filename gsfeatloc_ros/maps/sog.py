@@ -22,6 +22,7 @@ from gsfeatloc_ros.maps.assemble import (
     MAX_COMPRESSION_RATIO,
     MAX_PACKED_BYTES,
     Block,
+    Layout,
     assemble,
     block_slices,
     check_compression,
@@ -29,13 +30,14 @@ from gsfeatloc_ros.maps.assemble import (
     read_packed,
 )
 from gsfeatloc_ros.maps.gaussian_map import SH_COEFFICIENTS, GaussianMap, MapError
+from gsfeatloc_ros.maps.options import ReadOptions
 
 # A meta.json with all codebooks takes 16 KB.
 _MAX_META_BYTES = 1 << 20
 # Means, quaternions, scales, colour and opacity of a Gaussian, which hardly compress.
 _MIN_BYTES_PER_GAUSSIAN = 17
 # What zipfile raises on damage: the last two for features that it does not have and for passwords.
-_ZIP_ERRORS = (
+ZIP_ERRORS = (
     zipfile.BadZipFile,
     zlib.error,
     struct.error,
@@ -45,6 +47,8 @@ _ZIP_ERRORS = (
     RuntimeError,
 )
 _PALETTE_WIDTH, _MAX_PALETTE_SIZE = 64, 1 << 16
+# Of meta.json; asset tells the program that wrote it, extras are for applications.
+_META_KEYS = ("version", "count", "model", "antialias", "asset", "extras", "means", "scales", "quats", "sh0", "shN")
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,12 +62,13 @@ class _Sog:
     colors: np.ndarray  # (256, 3) coefficients of the first harmonic
     opacities: np.ndarray  # (256,)
     harmonics: np.ndarray | None  # (256,)
-    antialiased: bool
+    antialiased: bool | None
+    notes: tuple[str, ...]
     files: dict[str, list[str]]
 
 
-def read_sog(path: Path) -> GaussianMap:
-    """Read a map from a .sog file, a zip.
+def read_sog(path: Path, options: ReadOptions) -> GaussianMap:
+    """Read a map from a .sog file, a zip of its files or of the folder with them.
 
     Raises:
         MapError: a file in it is missing, truncated, damaged, of another version or not lossless.
@@ -71,33 +76,47 @@ def read_sog(path: Path) -> GaussianMap:
     """
     try:
         with zipfile.ZipFile(path) as archive:
-            meta_json = _read_member(path, archive, "meta.json", _MAX_META_BYTES)
-            return _read(path, meta_json, lambda name: _read_member(path, archive, name))
-    except _ZIP_ERRORS as error:
+            folder = _folder_of_meta(path, archive)
+            meta_json = _read_member(path, archive, folder + "meta.json", _MAX_META_BYTES)
+            layout, blocks = open_sog(path, meta_json, lambda name: _read_member(path, archive, folder + name))
+            return assemble(path, layout, blocks, options)
+    except ZIP_ERRORS as error:
         raise MapError(f"{path}: is truncated or damaged: {error}") from error
 
 
-def read_unbundled_sog(path: Path) -> GaussianMap:
-    """Read a map from the folder or the meta.json of an unbundled .sog.
+def read_unbundled_sog(path: Path, options: ReadOptions) -> GaussianMap:
+    """Read a map from the meta.json of an unbundled .sog.
 
     Raises:
         MapError: a file is missing, truncated, damaged, of another version or not lossless.
         OSError: one cannot be read.
     """
-    meta = path / "meta.json" if path.is_dir() else path
-    meta_json = _read_file(path, meta, _MAX_META_BYTES)
-    return _read(path, meta_json, lambda name: _read_file(path, meta.parent / name))
+    return assemble(path, *open_unbundled_sog(path), options)
+
+
+def open_unbundled_sog(path: Path) -> tuple[Layout, Iterator[Block]]:
+    """Return what the meta.json of an unbundled .sog says, and its Gaussians; raise as `read_unbundled_sog`."""
+    meta_json = _read_file(path, path, _MAX_META_BYTES)
+    return open_sog(path, meta_json, lambda name: _read_file(path, path.parent / name))
 
 
 def _read_file(path: Path, file: Path, limit: int = MAX_PACKED_BYTES) -> bytes:
     if not file.is_file():
-        raise MapError(f"{path}: is no unbundled .sog or lacks a file: {file} is missing")
+        raise MapError(f"{path}: lacks a file: {file} is missing")
     return read_packed(path, file, limit)
+
+
+def _folder_of_meta(path: Path, archive: zipfile.ZipFile) -> str:
+    """Return the folder in a zip, empty or with a slash at its end, that holds the one meta.json."""
+    found = [name[: -len("meta.json")] for name in archive.namelist() if name.rpartition("/")[2] == "meta.json"]
+    if len(found) != 1:
+        raise MapError(f"{path}: is a zip with {len(found)} meta.json, so no .sog or a damaged one")
+    return found[0]
 
 
 def _read_member(path: Path, archive: zipfile.ZipFile, name: str, limit: int = MAX_PACKED_BYTES) -> bytes:
     if name not in archive.namelist():
-        raise MapError(f"{path}: is a zip without {name}, so no .sog or a damaged one")
+        raise MapError(f"{path}: is a .sog without {name}, so a damaged one")
     member = archive.getinfo(name)
     if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         raise MapError(f"{path}: {name} is compressed in a way that a .sog is not: zip it with deflate or without")
@@ -107,21 +126,21 @@ def _read_member(path: Path, archive: zipfile.ZipFile, name: str, limit: int = M
     return archive.read(member)
 
 
-def _read(path: Path, meta_json: bytes, read: Callable[[str], bytes]) -> GaussianMap:
-    """Read a map by what its meta.json says; `read` gives the contents of the images that this names."""
-    try:
-        sog = _parse_meta(path, json.loads(meta_json))
-    except MapError:
-        raise
-    except (KeyError, IndexError, TypeError, ValueError, OverflowError, RecursionError) as error:
-        what = f"{type(error).__name__}: {error}"
-        raise MapError(f"{path}: meta.json is damaged or not that of a .sog ({what})") from error
-    for name in itertools.chain(*sog.files.values()):
-        # Names from a file must not lead out of its folder.
-        if not isinstance(name, str) or name in ("", ".", "..") or any(c in name for c in "/\\:\0"):
-            raise MapError(f"{path}: meta.json names the image {name!r}, which is no plain file name")
-    check_count(path, sog.count)
+def describe_unbundled_sog(path: Path) -> Layout:
+    """Return what the meta.json of an unbundled .sog of version 2 says, without decoding its images."""
+    sog = _parse(path, _read_file(path, path, _MAX_META_BYTES))
+    if sog.bands is None and "palette" in sog.files:
+        raise MapError(f"{path}: is a .sog of version 1, which is not read as a part of a streamed one")
+    files = [path.parent / name for name in itertools.chain(*sog.files.values())]
+    if missing := [file for file in files if not file.is_file()]:
+        raise MapError(f"{path}: lacks a file: {missing[0]} is missing")
+    check_compression(path, _MIN_BYTES_PER_GAUSSIAN * sog.count, sum(file.stat().st_size for file in files))
+    return Layout(sog.count, SH_COEFFICIENTS[sog.bands or 0], sog.antialiased, sog.notes)
 
+
+def open_sog(path: Path, meta_json: bytes, read: Callable[[str], bytes]) -> tuple[Layout, Iterator[Block]]:
+    """Return what a meta.json says, and its Gaussians; `read` gives the contents of the images that it names."""
+    sog = _parse(path, meta_json)
     images = {key: [read(name) for name in names] for key, names in sog.files.items()}
     check_compression(
         path, _MIN_BYTES_PER_GAUSSIAN * sog.count, sum(len(data) for group in images.values() for data in group)
@@ -134,7 +153,23 @@ def _read(path: Path, meta_json: bytes, read: Callable[[str], bytes]) -> Gaussia
     palette = _decode_palette(path, sog, images["palette"][0]) if "palette" in images else None
     del images
     coefficients = 1 if palette is None else 1 + palette.shape[1]
-    return assemble(path, sog.count, coefficients, _blocks(path, sog, pixels, palette), sog.antialiased)
+    return Layout(sog.count, coefficients, sog.antialiased, sog.notes), _blocks(path, sog, pixels, palette)
+
+
+def _parse(path: Path, meta_json: bytes) -> _Sog:
+    """Read a meta.json; refuse names of files that lead out of its folder."""
+    try:
+        sog = _parse_meta(path, json.loads(meta_json))
+    except MapError:
+        raise
+    except (KeyError, IndexError, TypeError, ValueError, OverflowError, RecursionError) as error:
+        what = f"{type(error).__name__}: {error}"
+        raise MapError(f"{path}: meta.json is damaged or not that of a .sog ({what})") from error
+    for name in itertools.chain(*sog.files.values()):
+        if not isinstance(name, str) or name in ("", ".", "..") or any(c in name for c in "/\\:\0"):
+            raise MapError(f"{path}: meta.json names the image {name!r}, which is no plain file name")
+    check_count(path, sog.count)
+    return sog
 
 
 def _parse_meta(path: Path, meta: dict) -> _Sog:
@@ -143,8 +178,11 @@ def _parse_meta(path: Path, meta: dict) -> _Sog:
     version = meta.get("version", 1)
     if version not in (1, 2):
         raise MapError(f"{path}: is a .sog of version {version}; versions 1 and 2 are read")
-    if meta.get("model") == "2dgs":
+    model = meta.get("model")
+    if model == "2dgs":
         raise MapError(f"{path}: is a 2D Gaussian splatting (2DGS) map; only 3D ones are read")
+    if model not in (None, "default", "antialiased"):
+        raise MapError(f"{path}: is of a model that is not known: {model!r}")
     files = {"means": meta["means"]["files"][:2]}
     files |= {key: meta[key]["files"][:1] for key in ("scales", "quats", "sh0")}
     rest = meta.get("shN")
@@ -178,9 +216,16 @@ def _parse_meta(path: Path, meta: dict) -> _Sog:
         colors=colors.astype(np.float32),
         opacities=opacities.astype(np.float32),
         harmonics=None if harmonics is None else harmonics.astype(np.float32),
-        antialiased=meta.get("model") == "antialiased" or meta.get("antialias") is True,
+        antialiased=_flag(meta.get("antialias")) if model is None else model == "antialiased",
+        notes=tuple(f"meta.json's {key!r} is not known and not used" for key in meta if key not in _META_KEYS),
         files=files,
     )
+
+
+def _flag(value: object) -> bool | None:
+    if value not in (None, True, False):
+        raise ValueError(f"{value!r} is no flag")
+    return None if value is None else bool(value)
 
 
 def _whole(value: object) -> int:

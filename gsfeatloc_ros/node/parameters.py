@@ -23,7 +23,9 @@ _BY_NAME = {parameter.name: parameter for parameter in PARAMETERS}
 
 def descriptor(parameter: Parameter) -> ParameterDescriptor:
     """Return what `ros2 param describe` shows and rclpy enforces."""
-    made = ParameterDescriptor(description=parameter.description, read_only=not parameter.live)
+    made = ParameterDescriptor(
+        description=parameter.description, read_only=not parameter.live, dynamic_typing=parameter.is_switch
+    )
     if parameter.choices:
         made.additional_constraints = f"One of {', '.join(parameter.choices)}."
     if parameter.bounds is not None:
@@ -56,7 +58,7 @@ def declare_parameters(node: Node) -> Settings:
 
 def read_settings(node: Node) -> Settings:
     """Return the values of all parameters, which are declared."""
-    values = {name: node.get_parameter(name).value for name in _BY_NAME}
+    values = {name: item.as_set(node.get_parameter(name).value) for name, item in _BY_NAME.items()}
     lists = {name: tuple(values[name]) for name, item in _BY_NAME.items() if isinstance(item.default, tuple)}
     return Settings.of(values | lists)
 
@@ -65,7 +67,8 @@ def check_choices(parameters: Sequence[RosParameter]) -> None:
     """Raise ValueError where a value is not one of its parameter's choices; parameters of other names are let pass."""
     for parameter in parameters:
         if parameter.name in _BY_NAME:
-            _BY_NAME[parameter.name].check(parameter.value)
+            about = _BY_NAME[parameter.name]
+            about.check(about.as_set(parameter.value))
 
 
 def without_retired(node: Node, parameters: Sequence[RosParameter]) -> list[RosParameter]:

@@ -85,6 +85,7 @@ class Session:
             node.create_timer(_SAVE_PERIOD, self._pose_file.save, clock=steady),
         ]
         self.use_settings(settings)
+        self._tell_reading()
 
     @property
     def engine(self) -> Engine:
@@ -142,6 +143,7 @@ class Session:
         self._publishers.forget()
         self._standing.publish()
         self._pose_file.use_map(self.settings.map)
+        self._tell_reading()
         self._index_build.start(self.settings)
 
     def use_settings(self, settings: Settings) -> None:
@@ -161,6 +163,15 @@ class Session:
         self._follower.lose("time went back", with_priors=False)
         self._publishers.forget()
 
+    def _tell_reading(self) -> None:
+        """Log what there is to say of how the map's file was read."""
+        reading, log = self.engine.renderer.reading, self._node.get_logger()
+        said = f"map {self.engine.map_path}: {'; '.join(reading.notes)}"
+        if reading.left_out:
+            log.warning(said)
+        elif reading.notes:
+            log.info(said)
+
     def _use_saved_pose(self) -> None:
         pose = self._pose_file.load() if self.settings.node.track else None
         if pose is not None:
@@ -178,5 +189,13 @@ class Session:
                 self.settings.image.timeout, mode != ON_REQUEST, self.reception.no_image
             )
         age = "nan" if last is None else f"{1e-9 * (self._node.get_clock().now().nanoseconds - last):.1f}"
-        about = {"mode": mode, "map": self.engine.map_path, "device": self.engine.renderer.device, "answer_age": age}
+        renderer = self.engine.renderer
+        about = {
+            "mode": mode,
+            "map": self.engine.map_path,
+            "map_left_out": str(renderer.reading.left_out),
+            "map_notes": "; ".join(renderer.reading.notes),
+            "device": renderer.device,
+            "answer_age": age,
+        }
         self._report.publish_health(level, reason, about)

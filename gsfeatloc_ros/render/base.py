@@ -12,7 +12,7 @@ import numpy as np
 
 from gsfeatloc_ros.common.arrays import Array, to_host
 from gsfeatloc_ros.common.camera import Camera
-from gsfeatloc_ros.maps.gaussian_map import SH_COEFFICIENTS
+from gsfeatloc_ros.maps.gaussian_map import SH_COEFFICIENTS, Reading
 from gsfeatloc_ros.maps.similarity import Similarity
 
 # Conventions of gsplat and of the INRIA rasterizer: a Gaussian is blurred by 0.3 square pixels, contributes where its
@@ -118,6 +118,11 @@ class Renderer(Protocol):
         """Centres (n, 3) float64, map frame, of a sample of the Gaussians that are solid: what there is to see."""
         ...
 
+    @property
+    def reading(self) -> Reading:
+        """What there is to say of how the map's file was read."""
+        ...
+
     def render(self, camera: Camera, T_map_camera: np.ndarray) -> Render:
         """Draw what `camera` (its distortion ignored) sees from the pose `T_map_camera` (4, 4)."""
         ...
@@ -128,6 +133,9 @@ class Placed(Protocol):
 
     @property
     def S_map_splat(self) -> Similarity: ...
+
+    @property
+    def reading(self) -> Reading: ...
 
     def solid_points(self, count: int) -> np.ndarray:
         """Return the centres (n, 3), splat frame, of up to `count` solid Gaussians."""
@@ -146,7 +154,7 @@ class SplatRenderer(ABC):
     """A renderer that draws in the splat frame: the camera is moved there, and depths come back in map units."""
 
     def __init__(self, placed_map: Placed, device: str = "cpu") -> None:
-        self.device = device
+        self.device, self.reading = device, placed_map.reading
         self._map_scale = placed_map.S_map_splat.scale
         self._S_splat_map = placed_map.S_map_splat.inverse()
         self.solid_points = placed_map.S_map_splat.transform(placed_map.solid_points(_SOLID_POINTS))

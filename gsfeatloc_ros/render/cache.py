@@ -9,7 +9,7 @@ import logging
 import math
 import os
 import zlib
-from dataclasses import replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -18,7 +18,8 @@ import numpy as np
 from gsfeatloc_ros.common.kernel_cache import hash_of_sources
 from gsfeatloc_ros.common.replaced_file import replaced_file
 from gsfeatloc_ros.common.safe_files import open_own, open_regular
-from gsfeatloc_ros.maps import MapError, Similarity, load_map
+from gsfeatloc_ros.maps import MapError, Reading, ReadOptions, Similarity, load_map
+from gsfeatloc_ros.maps.files import map_files
 from gsfeatloc_ros.maps.gaussian_map import SH_COEFFICIENTS
 from gsfeatloc_ros.render.prepare import CHUNK, LOG2_OPACITY, MEAN_X, MEAN_Z, ROWS, PreparedMap, prepare
 
@@ -26,17 +27,17 @@ SUFFIX = ".gsfeatloc-cache"
 
 _log = logging.getLogger(__name__)
 
+_DEFAULT_OPTIONS = ReadOptions()
+
 # Only what no other user can have written is read: the checksum tells damage, no more. A cache is this line, the CRC-32
-# of all that follows the next number (4 bytes), the header's length (4 bytes, both little-endian), the header (JSON) and
-# the arrays one after another.
+# of all that follows the next number (4 bytes), the header's length (4 bytes, both little-endian), the header (JSON)
+# and the arrays one after another.
 _MAGIC = b"gsfeatloc_ros prepared map 2\n"
 # Gaussians of a map of 1 TB; more chunks are a lie.
 _MAX_CHUNKS = 2**32 // CHUNK
 _MAX_HEADER_BYTES = 64 * 1024
 # All ones in a half: infinite, or no number.
 _HALF_EXPONENT = np.uint16(0x7C00)
-# An unbundled .sog is the files of these kinds in its folder.
-_SOG_SUFFIXES = (".json", ".webp")
 
 
 class _CacheError(Exception):
@@ -44,13 +45,16 @@ class _CacheError(Exception):
 
 
 def load_prepared(
-    path: str | Path, alignment: Similarity | None = None, cache_path: str | Path | None = None
+    path: str | Path,
+    alignment: Similarity | None = None,
+    options: ReadOptions = _DEFAULT_OPTIONS,
+    cache_path: str | Path | None = None,
 ) -> PreparedMap:
     """Read a map prepared from its cache; where there is none for it, load and prepare it, and write the cache.
 
     Args:
-        path: the map, as for load_map.
-        alignment: the map's S_map_splat; it is no part of the cache.
+        path, options: as for load_map.
+        alignment: as for load_map; it is no part of the cache.
         cache_path: file of the cache; None for the map's name and SUFFIX, in the same folder. That it cannot be
             written is no error.
 
@@ -60,12 +64,13 @@ def load_prepared(
     path = Path(path)
     absolute = Path(os.path.abspath(path))
     cache_path = absolute.with_name(absolute.name + SUFFIX) if cache_path is None else Path(cache_path)
-    origin = {"code": _code(), "map": [_content(file) for file in _map_files(absolute)]}
+    content = [_content(file) for file in map_files(absolute)]
+    origin = {"code": _code(), "map": content, "options": asdict(options)}
     prepared = _read_if_usable(cache_path, origin)
     if prepared is None:
-        prepared = prepare(load_map(path))
+        prepared = prepare(load_map(path, options=options))
         _write_if_possible(cache_path, prepared, origin)
-    return prepared if alignment is None else replace(prepared, S_map_splat=alignment)
+    return prepared if alignment is None else prepared.placed(alignment)
 
 
 def _read_if_usable(path: Path, origin: dict[str, Any]) -> PreparedMap | None:
@@ -92,6 +97,8 @@ def _read(stream: BinaryIO, origin: dict[str, Any]) -> PreparedMap | None:
         if header["origin"] != origin:
             return None
         chunks, coefficients, antialiased = (header[name] for name in ("chunks", "sh_coefficients", "antialiased"))
+        offset = Similarity(translation=np.array(header["offset"]))
+        reading = Reading(tuple(header["notes"]), header["left_out"], header["other"])
     except (KeyError, TypeError, ValueError, RecursionError) as error:
         raise _CacheError("is damaged") from error
     known = type(chunks) is int and type(coefficients) is int and type(antialiased) is bool
@@ -104,7 +111,7 @@ def _read(stream: BinaryIO, origin: dict[str, Any]) -> PreparedMap | None:
     arrays = {
         name: np.fromfile(stream, dtype, math.prod(shape)).reshape(shape) for name, (dtype, shape) in layout.items()
     }
-    prepared = PreparedMap(arrays["gaussians"], arrays["sh"], arrays["low"], arrays["high"], antialiased=antialiased)
+    prepared = PreparedMap(**arrays, antialiased=antialiased, S_map_splat=offset, reading=reading)
     if _checksum(encoded, arrays) != checksum or not _is_possible(prepared):
         raise _CacheError("is damaged")
     return prepared
@@ -141,9 +148,10 @@ def _write_if_possible(path: Path, prepared: PreparedMap, origin: dict[str, Any]
 
 
 def _write(stream: BinaryIO, prepared: PreparedMap, origin: dict[str, Any]) -> None:
-    about = {"chunks": len(prepared.gaussians), "sh_coefficients": prepared.sh_coefficients}
+    about: dict[str, Any] = {"chunks": len(prepared.gaussians), "sh_coefficients": prepared.sh_coefficients}
     arrays: dict[str, np.ndarray] = {name: getattr(prepared, name) for name in _layout(0, 1)}
-    encoded = json.dumps({"origin": origin, "antialiased": prepared.antialiased, **about}).encode()
+    about |= {"antialiased": prepared.antialiased, "offset": prepared.S_map_splat.translation.tolist()}
+    encoded = json.dumps({"origin": origin, **about, **asdict(prepared.reading)}).encode()
     stream.write(_MAGIC)
     for number in (_checksum(encoded, arrays), len(encoded)):
         stream.write(number.to_bytes(4, "little"))
@@ -167,20 +175,10 @@ def map_content(path: str | Path) -> list[Any]:
     Raises:
         MapError: the map cannot be read.
     """
-    files = _map_files(Path(os.path.abspath(path)))
+    files = map_files(Path(os.path.abspath(path)))
     if not files:
         raise MapError(f"{path}: cannot be read: there is no such map")
     return [_content(file) for file in files]
-
-
-def _map_files(path: Path) -> list[Path]:
-    """Return the files that a map consists of; raise MapError where they cannot be listed."""
-    folder = path if path.is_dir() else path.parent if path.suffix == ".json" else None
-    try:
-        files = [path] if folder is None else sorted(file for file in folder.iterdir() if file.suffix in _SOG_SUFFIXES)
-    except OSError as error:
-        raise MapError(f"{path}: cannot be read: {error.strerror or error}") from error
-    return [file for file in files if file.is_file()]
 
 
 def _content(file: Path) -> list[Any]:

@@ -6,11 +6,11 @@ from __future__ import annotations
 
 import math
 import threading
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from gsfeatloc_ros.maps.gaussian_map import SH_COEFFICIENTS, GaussianMap, sample_solid
+from gsfeatloc_ros.maps.gaussian_map import SH_COEFFICIENTS, GaussianMap, Reading, sample_solid
 from gsfeatloc_ros.maps.similarity import Similarity
 from gsfeatloc_ros.render.base import MIN_ALPHA
 from gsfeatloc_ros.render.kernels import njit, prange
@@ -41,7 +41,7 @@ class PreparedMap:
             to 8-bit colours by far, and halves what a map takes.
         low, high: (chunks, 3) float32, splat frame, the box outside which no Gaussian of the chunk has an alpha of
             MIN_ALPHA.
-        antialiased, S_map_splat: as in GaussianMap.
+        antialiased, S_map_splat, reading: as in GaussianMap.
     """
 
     gaussians: np.ndarray
@@ -50,6 +50,11 @@ class PreparedMap:
     high: np.ndarray
     antialiased: bool = False
     S_map_splat: Similarity = field(default_factory=Similarity)
+    reading: Reading = field(default_factory=Reading)
+
+    def placed(self, S_map_file: Similarity) -> PreparedMap:
+        """Return the same where the frame of its file lies elsewhere in the robot's map frame."""
+        return replace(self, S_map_splat=S_map_file @ self.S_map_splat)
 
     @property
     def sh_coefficients(self) -> int:
@@ -115,6 +120,7 @@ def prepare(gaussian_map: GaussianMap) -> PreparedMap:
         high=np.empty((chunks, 3), dtype=np.float32),
         antialiased=gaussian_map.antialiased,
         S_map_splat=gaussian_map.S_map_splat,
+        reading=gaussian_map.reading,
     )
     # Sorted in the memory that the Gaussians then take: there is least to spare at this time.
     keys = prepared.gaussians.reshape(-1).view(np.uint64)[:count]

@@ -42,7 +42,7 @@ _LOG_MIN_ALPHA = _F(math.log2(base.MIN_ALPHA))
 # From -0.5 d^T conic d, and from 2 ln(255 opacity), to base 2.
 _CONIC_SCALE = _F(-0.5 * math.log2(math.e))
 _RADIUS2_SCALE = _F(2.0 * math.log(2.0))
-# Spherical harmonics' constants, as in render/reference.py.
+# Spherical harmonics' constants, as in maps/harmonics.py.
 _SH0, _SH1 = _F(0.28209479177387814), _F(0.4886025119029199)
 _SH2A, _SH2B, _SH2C = (_F(1.0925484305920792), _F(0.31539156525252005), _F(0.5462742152960396))
 _SH3A, _SH3B, _SH3C = (_F(0.5900435899266435), _F(2.890611442640554), _F(0.4570457994644658))

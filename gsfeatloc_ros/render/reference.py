@@ -11,6 +11,7 @@ import torch
 
 from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.maps.gaussian_map import GaussianMap
+from gsfeatloc_ros.maps.harmonics import harmonics
 from gsfeatloc_ros.render.base import (
     DEPTH_MIN_ALPHA,
     EPS2D,
@@ -136,22 +137,5 @@ def _project(camera: Camera, points: torch.Tensor, covariances: torch.Tensor) ->
 def _colors(sh: torch.Tensor, offsets: torch.Tensor) -> torch.Tensor:
     """Return the colours (N, 3) of harmonics (N, C, 3) seen along offsets (N, 3) from the camera, splat frame."""
     x, y, z = torch.nn.functional.normalize(offsets, dim=1).unbind(1)
-    basis = [
-        torch.full_like(x, 0.28209479177387814),
-        -0.4886025119029199 * y,
-        0.4886025119029199 * z,
-        -0.4886025119029199 * x,
-        1.0925484305920792 * x * y,
-        -1.0925484305920792 * y * z,
-        0.31539156525252005 * (2 * z * z - x * x - y * y),
-        -1.0925484305920792 * x * z,
-        0.5462742152960396 * (x * x - y * y),
-        -0.5900435899266435 * y * (3 * x * x - y * y),
-        2.890611442640554 * x * y * z,
-        -0.4570457994644658 * y * (4 * z * z - x * x - y * y),
-        0.3731763325901154 * z * (2 * z * z - 3 * x * x - 3 * y * y),
-        -0.4570457994644658 * x * (4 * z * z - x * x - y * y),
-        1.445305721320277 * z * (x * x - y * y),
-        -0.5900435899266435 * x * (x * x - 3 * y * y),
-    ]
+    basis = harmonics(x, y, z)
     return (torch.stack(basis[: sh.shape[1]], 1)[:, :, None] * sh).sum(1).add(0.5).clamp(min=0.0)

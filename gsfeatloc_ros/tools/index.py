@@ -26,7 +26,7 @@ from gsfeatloc_ros.localize.map_index import index_key
 from gsfeatloc_ros.localize.settings import MatcherSettings, RendererSettings
 from gsfeatloc_ros.match import MATCHERS
 from gsfeatloc_ros.render import DEVICES
-from gsfeatloc_ros.tools.options import add_map_options, map_settings, number
+from gsfeatloc_ros.tools.options import add_map_options, map_settings, number, print_reading
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -61,6 +61,7 @@ def _make(options: argparse.Namespace) -> tuple[Path, ViewIndex]:
     if options.poses:
         poses = np.array([placed.transform_pose(pose) for pose in load_poses(options.poses)])
     renderer = load_renderer(map_, RendererSettings(options.device, options.threads))
+    print_reading("index", renderer)
     features = load_matcher(matcher, renderer.device)
     with tqdm(desc="views", unit="view", disable=None) as bar:
 

@@ -11,6 +11,8 @@ from typing import Any
 from gsfeatloc_ros.common.parameter import parameters_of
 from gsfeatloc_ros.localize.options import LocalizerOptions
 from gsfeatloc_ros.localize.settings import MapSettings
+from gsfeatloc_ros.maps import ReadOptions
+from gsfeatloc_ros.render import Renderer
 
 # Have options of the commands of their own.
 _OWN_OPTIONS = ("max_image_width", "seed")
@@ -88,6 +90,21 @@ def add_map_options(parser: argparse.ArgumentParser) -> None:
     frame.add_argument("--map-translation", type=finite, nargs=3, default=default.translation, metavar=("X", "Y", "Z"))
     frame.add_argument("--map-rotation", type=finite, nargs=4, default=default.rotation, metavar=("X", "Y", "Z", "W"))
     frame.add_argument("--dataparser-transforms", default="", metavar="FILE", help="nerfstudio's")
+    file = parser.add_argument_group("the map's file", "what it may leave open, as the node's parameters map.*")
+    for option in parameters_of(ReadOptions):
+        file.add_argument(
+            f"--map-{option.name.replace('_', '-')}",
+            type=type(option.default),
+            choices=option.choices or None,
+            default=option.default,
+            help="default: %(default)s",
+        )
+
+
+def print_reading(tool: str, renderer: Renderer) -> None:
+    """Print to the terminal what there is to say of how a map's file was read."""
+    for note in renderer.reading.notes:
+        print(f"{tool}: map: {note}", file=sys.stderr)
 
 
 def map_settings(options: argparse.Namespace) -> MapSettings:
@@ -99,6 +116,7 @@ def map_settings(options: argparse.Namespace) -> MapSettings:
         translation=tuple(options.map_translation),
         rotation=tuple(options.map_rotation),
         dataparser_transforms=options.dataparser_transforms,
+        reading=ReadOptions(options.map_antialiased, options.map_spz_axes, options.map_level),
     )
 
 

@@ -42,6 +42,7 @@ from gsfeatloc_ros.tools.options import (
     localizer_options,
     map_settings,
     number,
+    print_reading,
     setting,
 )
 
@@ -113,6 +114,7 @@ def _collect(replay: Replay, count: int) -> tuple[list[ReplayedImage], int]:
 def _localizer(options: argparse.Namespace) -> Localizer:
     map_ = map_settings(options)
     renderer = load_renderer(map_, RendererSettings())
+    print_reading("replay", renderer)
     matcher = load_matcher(MatcherSettings(options.matcher, options.weights), renderer.device)
     values = {"max_image_width": options.max_width, "seed": options.seed, **options.set}
     return Engine(map_.path, renderer, matcher, settings_from(LocalizerOptions, values)).localizer

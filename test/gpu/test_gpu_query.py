@@ -32,7 +32,7 @@ class OnGpu:
 
     def __init__(self, gaussian_map) -> None:
         self._renderer = CpuRenderer(gaussian_map)
-        self.solid_points = self._renderer.solid_points
+        self.solid_points, self.reading = self._renderer.solid_points, self._renderer.reading
 
     def render(self, camera, T_map_camera) -> Render:
         pictures = vars(self._renderer.render(camera, T_map_camera)).values()

@@ -22,6 +22,12 @@ def maps() -> Path:
 
 
 @pytest.fixture(scope="session")
+def cases() -> Path:
+    """Return the folder of what people brought, made after public reports."""
+    return _folder("cases", "GSFEATLOC_CASES", "filter_3d.ply")
+
+
+@pytest.fixture(scope="session")
 def real_file(request: pytest.FixtureRequest) -> Callable[[str], Path]:
     """Return the function that finds a file by "scenes/..." or "maps/..."."""
 

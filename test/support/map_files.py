@@ -22,7 +22,7 @@ from gsfeatloc_ros.maps import GaussianMap, MapError, load_map
 ARRAYS = ("means", "scales", "rotations", "opacities", "sh")
 SH_C0 = 0.28209479177387814
 # Signs of the harmonics 0 to 15 turned by half a turn about x: minus for an odd power of y and z together.
-FLIPPED = [0, 1, 1, 0, 1, 0, 0, 1, 0, 1, 0, 1, 1, 0, 1, 0]
+FLIPPED = [0, 1, 1, 0, 1, 0, 0, 1, 0, 1, 0, 1, 1, 0, 1, 0] + 9 * [0]  # those of degree 4 are not read
 
 
 def sample_map(count: int, sh_degree: int, seed: int) -> GaussianMap:
@@ -238,6 +238,65 @@ def bundle(path: Path, folder: Path) -> Path:
         for file in sorted(folder.iterdir()):
             archive.write(file, file.name)
     return path
+
+
+def write_streamed_sog(folder: Path, levels: list[list[GaussianMap]], environment: GaussianMap | None = None) -> Path:
+    """Streamed .sog of parts at several levels of detail; all parts of a level are in one tree of depth 1."""
+    filenames, children = [], []
+    for level, parts in enumerate(levels):
+        for index, part in enumerate(parts):
+            name = f"{level}_{index}"
+            write_sog_in(folder / name, part)
+            filenames.append(f"{name}/meta.json")
+            place = {"file": len(filenames) - 1, "offset": 0, "count": len(part)}
+            children.append({"bound": {}, "lods": {str(level): place}})
+    meta: dict = {"version": 1, "lodLevels": len(levels), "filenames": filenames}
+    meta["counts"] = [sum(map(len, parts)) for parts in levels]
+    meta["count"], meta["tree"] = sum(meta["counts"]), {"bound": {}, "children": children}
+    if environment is not None:
+        write_sog_in(folder / "env", environment)
+        meta["environment"] = "env/meta.json"
+    (folder / "lod-meta.json").write_text(json.dumps(meta))
+    return folder
+
+
+def write_sog_in(folder: Path, m: GaussianMap) -> None:
+    """Unbundled .sog of version 2 in a folder that need not be there."""
+    folder.mkdir(parents=True)
+    write_sog(folder, m, 2)
+
+
+def write_gsplat_png(folder: Path, m: GaussianMap) -> Path:
+    """PNG images of gsplat's PngCompression, of a square number of Gaussians, each with a centroid of its own."""
+    folder.mkdir()
+    side, meta = math.isqrt(len(m)), {}
+    opacities = m.opacities.astype(float).clip(max=0.9999)
+    values = {
+        "means": np.sign(m.means) * np.log1p(np.abs(m.means.astype(float))),
+        "scales": np.log(m.scales.astype(float)),
+        "quats": m.rotations.astype(float),
+        "opacities": np.log(opacities / (1 - opacities))[:, None],
+        "sh0": m.sh[:, 0].astype(float),
+    }
+    for name, array in values.items():
+        low, high = array.min(0), array.max(0)
+        numbers = np.round((array - low) / (high - low) * (65535 if name == "means" else 255)).astype(int)
+        shape = list(array.shape) if name != "sh0" else [len(m), 1, 3]
+        meta[name] = {"shape": shape if name != "opacities" else [len(m)], "dtype": "float32"}
+        meta[name] |= {"mins": low.tolist(), "maxs": high.tolist()}
+        images = {f"{name}_l": numbers & 255, f"{name}_u": numbers >> 8} if name == "means" else {name: numbers}
+        for file, pixels in images.items():
+            image = pixels.astype(np.uint8).reshape(side, side, -1)
+            order = [2, 1, 0, 3][: image.shape[2]] if image.shape[2] > 1 else [0]
+            cv2.imwrite(str(folder / f"{file}.png"), image[..., order])
+    rest = m.sh[:, 1:].astype(float)
+    if rest.shape[1]:
+        low, high = rest.min(), rest.max()
+        centroids = np.round((rest.reshape(len(m), -1) - low) / (high - low) * 63).astype(np.uint8)
+        np.savez_compressed(folder / "shN.npz", centroids=centroids, labels=np.arange(len(m), dtype=np.uint16))
+        meta["shN"] = {"shape": list(rest.shape), "dtype": "float32", "mins": low, "maxs": high, "quantization": 6}
+    (folder / "meta.json").write_text(json.dumps(meta))
+    return folder
 
 
 def check_damaged(path: Path, peak_limit: float) -> None:

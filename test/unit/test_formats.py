@@ -165,19 +165,21 @@ def test_extensions_of_spz_are_passed_over(tmp_path):
 def refused(path: Path, match: str, peak_limit: float = 2e6) -> None:
     """`path` is refused with a message that names it, without taking much memory."""
     tracemalloc.start()
-    with pytest.raises(MapError, match=match) as error:
-        load_map(path)
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
+    try:
+        with pytest.raises(MapError, match=match) as error:
+            load_map(path)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
     assert str(path) in str(error.value)
     assert peak < peak_limit
 
 
 def test_bytes_of_no_format(tmp_path):
     (tmp_path / "map").write_bytes(b"\xff" * 320)
-    refused(tmp_path / "map", r"none of \.ply, \.spz, \.sog and \.splat")
+    refused(tmp_path / "map", "of no format that is read")
     (tmp_path / "map").write_bytes(b"hello")
-    refused(tmp_path / "map", r"none of \.ply, \.spz, \.sog and \.splat")
+    refused(tmp_path / "map", "of no format that is read")
 
 
 def test_more_gaussians_than_are_read(tmp_path):
@@ -189,7 +191,7 @@ def test_more_gaussians_than_are_read(tmp_path):
 def test_splat_of_negative_scales(tmp_path):
     gaussian_map = sample_map(4, 0, 0)
     gaussian_map.scales[2, 1] = -1.0
-    refused(write_splat(tmp_path / "map", gaussian_map), "negative scales")
+    refused(write_splat(tmp_path / "map", gaussian_map), "no positive scale")
 
 
 @pytest.mark.parametrize("version", [2, 3, 4])
@@ -200,7 +202,8 @@ def test_splat_of_negative_scales(tmp_path):
         ({"count": 2**32 - 1}, "at most"),
         ({"count": MAX_GAUSSIANS}, "damaged"),
         ({"count": 41}, "truncated"),
-        ({"sh_degree": 4}, "degree 4"),
+        ({"sh_degree": 5}, "degree 5"),
+        ({"flags": 4}, "flag 0x4"),
         ({"fractional_bits": 25}, "25 fractional bits"),
     ],
 )
@@ -219,17 +222,9 @@ def test_spz_of_unknown_version(tmp_path, version):
     refused(tmp_path / "gzip", f"version {version}")
 
 
-def test_spz_with_other_axes(tmp_path):
-    luf = struct.pack("<III", 0xADBE0003, 4, 7)
-    rub = struct.pack("<III", 0xADBE0003, 4, 4)
-    for version in (3, 4):
-        refused(write_spz(tmp_path / "map", sample_map(3, 0, 0), version, luf, flags=2), "axes")
-        assert len(load_map(write_spz(tmp_path / "map", sample_map(3, 0, 0), version, rub, flags=2))) == 3
-
-
 def test_gzip_of_something_else(tmp_path):
     (tmp_path / "map").write_bytes(gzip.compress(b"a letter to a friend"))
-    refused(tmp_path / "map", r"no \.spz is in it")
+    refused(tmp_path / "map", r"no \.spz in it: unpack it")
 
 
 def test_gzip_bomb(tmp_path):
@@ -339,15 +334,25 @@ def test_names_in_a_sog_do_not_lead_out_of_it(tmp_path, name):
     refused(bundle(tmp_path / "map.sog", folder), "plain file name")
 
 
-@pytest.mark.parametrize("content", [b"", b"{", b"[]", b"null", b"{}", b"\xff", b"[" * 100_000, b'{"version": 2}'])
-def test_sog_meta_of_no_sog(tmp_path, content):
+@pytest.mark.parametrize(
+    ("content", "match"),
+    [
+        (b"", "empty"),
+        (b"{", "damaged JSON"),
+        (b"[]", "looks like a text"),
+        (b"null", "looks like a text"),
+        (b"{}", "no meta.json of a .sog"),
+        (b"\xff", "no format that is read"),
+        (b'{"a":' * 100_000, "damaged JSON"),
+        (b'{"version": 2}', "no meta.json of a .sog"),
+        (b'{"version": 2, "means": {}}', "meta.json is damaged or not that of a .sog"),
+    ],
+    ids=range(9),
+)
+def test_sog_meta_of_no_sog(tmp_path, content, match):
     folder = write_sog(tmp_path / "sog", sample_map(10, 0, 0), 2)
     (folder / "meta.json").write_bytes(content)
-    refused(folder, "meta.json is damaged or not that of a .sog")
-
-
-def test_folder_of_no_sog(tmp_path):
-    refused(tmp_path, "meta.json is missing")
+    refused(folder / "meta.json", match)
 
 
 def test_sog_labels_beyond_the_palette(tmp_path):
@@ -379,7 +384,7 @@ def test_webp_that_is_lossy(tmp_path, channels):
 
 
 def test_files_larger_than_any_map(tmp_path):
-    for name, head, size in (("map.spz", b"NGSP", 66 * MAX_GAUSSIANS), ("meta.json", b"{" + 64 * b" ", 1 << 30)):
+    for name, head, size in (("map.spz", b"NGSP", 66 * MAX_GAUSSIANS), ("meta.json", b"{" + 300 * b" ", 1 << 30)):
         with (tmp_path / name).open("wb") as stream:
             stream.write(head)
             stream.truncate(size)  # a file of holes

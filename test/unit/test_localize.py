@@ -238,7 +238,7 @@ class CountingRenderer:
 
     def __init__(self, renderer) -> None:
         self._renderer = renderer
-        self.device = renderer.device
+        self.device, self.reading = renderer.device, renderer.reading
         self.widths: list[int] = []
 
     def render(self, camera: Camera, T_map_camera: np.ndarray) -> Render:

@@ -160,7 +160,10 @@ def test_answers_are_in_the_robots_frame(room_map, room_camera, room_photos, see
 def test_a_map_is_loaded_with_its_alignment(room_map_file):
     assert load_map(room_map_file).S_map_splat.scale == 1.0
     alignment = random_similarity(0)
-    assert load_map(room_map_file, alignment).S_map_splat is alignment
+    placed = load_map(room_map_file, alignment).S_map_splat
+    assert placed.scale == alignment.scale
+    np.testing.assert_array_equal(placed.rotation, alignment.rotation)
+    np.testing.assert_array_equal(placed.translation, alignment.translation)
 
 
 # nerfstudio
