@@ -219,7 +219,7 @@ def test_no_flipped_byte_goes_unnoticed(map_file, data):
 def forged(map_path: Path, **header) -> None:
     """Change the cache's header, with a checksum that fits."""
     content = cache_of(map_path).read_bytes()
-    start = content.index(b"{")
+    start = len(cache._MAGIC) + 8
     end = start + int.from_bytes(content[start - 4 : start], "little")
     encoded = json.dumps(json.loads(content[start:end]) | header).encode()
     checksum = zlib.crc32(content[end:], zlib.crc32(encoded))
@@ -254,7 +254,7 @@ def test_shapes_that_the_arrays_cannot_have_are_refused_before_memory_is_taken(m
 
 def cache_origin(map_path: Path) -> dict:
     content = cache_of(map_path).read_bytes()
-    start = content.index(b"{")
+    start = len(cache._MAGIC) + 8
     return json.loads(content[start : start + int.from_bytes(content[start - 4 : start], "little")])["origin"]
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from copy import copy
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -15,6 +17,7 @@ from gsfeatloc_ros.localize.localizer import Localizer
 from gsfeatloc_ros.localize.options import LocalizerOptions
 from gsfeatloc_ros.localize.query import Components, MatchedView, Query
 from gsfeatloc_ros.localize.search import SEARCH_WIDTH, look, promising, spread_poses
+from gsfeatloc_ros.maps import Reading
 from gsfeatloc_ros.match import create_matcher, create_tracker
 from gsfeatloc_ros.render import create_renderer
 
@@ -146,11 +149,14 @@ def test_easy_photos_search_nothing(renderer, room_camera, room_photos) -> None:
 
 def test_the_search_ends_with_a_reason(renderer, room_camera) -> None:
     noise = np.random.default_rng(0).integers(0, 256, (480, 640, 3), dtype=np.uint8)
-    localizer = Localizer(renderer, create_matcher("sift"), LocalizerOptions(max_views=9))
+    doubtful = copy(renderer)
+    doubtful.reading = Reading(other="set map.spz_axes:=ply")
+    localizer = Localizer(doubtful, create_matcher("sift"), LocalizerOptions(max_views=9))
     estimate = localizer.localize(noise, room_camera, np.eye(4))
     assert not estimate.localized
     assert estimate.evidence.views == 9
     assert "nothing in common" in estimate.reason
+    assert estimate.reason.endswith(". set map.spz_axes:=ply")
 
 
 @pytest.mark.parametrize("covariance", [np.eye(3), np.full((6, 6), np.nan)])
