@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 from itertools import islice
 
 import cv2
@@ -21,6 +21,7 @@ from gsfeatloc_ros.localize.comparison import changed_mask, compare, preference
 from gsfeatloc_ros.localize.estimate import Estimate, Status, Trace
 from gsfeatloc_ros.localize.evidence import (
     Evidence,
+    Limits,
     coverage,
     focal_length_is_wrong,
     is_uncertain,
@@ -145,8 +146,12 @@ class Localizer:
             return Trace(Estimate(Status.FAILED, reason), query.photo)
         search = Search(small, prior, self._now)
         rejected: _Candidate | None = None
+        limits = self._components.options.limits
+        mirror_probability_wrong = cache(partial(self._mirror_probability_wrong, query))
         for pose in search.poses():
-            candidate = self._compared_with_mirror(query, self._refine(query, pose, prior))
+            candidate = self._refine(query, pose, prior)
+            if query.components.index is not None and is_uncertain(candidate.evidence, limits):
+                candidate = candidate.against_mirror(mirror_probability_wrong(), limits)
             if candidate.believed:
                 best, rivals = self._best(query, candidate, search, prior)
                 return best.trace(query.photo, search, rivals)
@@ -174,22 +179,17 @@ class Localizer:
                 equals.append(rival)
         return found, equals
 
-    def _compared_with_mirror(self, query: Query, candidate: _Candidate) -> _Candidate:
-        """Ask the index for a pose of the photo's mirror image, where that decides whether the candidate is believed.
+    def _mirror_probability_wrong(self, query: Query) -> float:
+        """Return the probability that what the index suggests for the photo's mirror image is wrong; 1 for nothing.
 
         Nearly symmetric objects explain the mirror images of their photos well, but not as well as the photos.
         """
-        components, limits = query.components, query.components.options.limits
-        if components.index is None or not is_uncertain(candidate.evidence, limits):
-            return candidate
-        options = components.options
-        few = replace(options, search=replace(options.search, max_views=_MIRROR_VIEWS))
-        mirror = Query(replace(components, options=few), query.photo.mirrored(), query.clock)
+        options = query.components.options
+        few = replace(options, search=replace(options.search, max_views=_MIRROR_VIEWS, skipped=0))
+        mirror = Query(replace(query.components, options=few), query.photo.mirrored(), query.clock)
         search = Search(mirror.limited(SEARCH_WIDTH), None, self._now)
         found = [self._refine(mirror, pose, None).evidence for pose in islice(search.poses(), _MIRROR_POSES)]
-        best = min((e.probability_wrong for e in found if e.inliers >= limits.min_inliers), default=1.0)
-        evidence = replace(candidate.evidence, mirror_probability_wrong=best)
-        return replace(candidate, evidence=evidence, reasons_against=verdict(evidence, limits))
+        return min((e.probability_wrong for e in found if e.inliers >= options.limits.min_inliers), default=1.0)
 
     def _refine(self, query: Query, pose: np.ndarray, prior: Prior | None) -> _Candidate:
         """Render and track at `pose`, then at each estimate, until the render is where the photo is; then verify."""
@@ -267,6 +267,11 @@ class _Candidate:
     def only_the_camera_is_wrong(self) -> bool:
         """Whether nothing but the camera's calibration speaks against it: no other view would help."""
         return len(self.reasons_against) == 1 and focal_length_is_wrong(self.evidence)
+
+    def against_mirror(self, mirror_probability_wrong: float, limits: Limits) -> _Candidate:
+        """Return the candidate judged with what is known of the photo's mirror image."""
+        evidence = replace(self.evidence, mirror_probability_wrong=mirror_probability_wrong)
+        return replace(self, evidence=evidence, reasons_against=verdict(evidence, limits))
 
     @property
     def covariance(self) -> np.ndarray:

@@ -62,7 +62,7 @@ class Search:
     def __init__(self, small: Query, prior: Prior | None, now: Callable[[], float]) -> None:
         self._small, self._prior, self._now = small, prior, now
         self.best: MatchedView | None = None
-        self.views = self.searched = 0
+        self.views = self.searched = self._around = 0
         self._pending: list[tuple[float, int, Hint]] = []
 
     def poses(self) -> Iterator[np.ndarray]:
@@ -74,14 +74,16 @@ class Search:
         if self._prior is not None:
             poses = self._spread(self._prior)
             for start in range(0, len(poses), _BATCH):
-                yield from self._look(poses[start : start + _BATCH])
+                batch = poses[start : start + _BATCH]
+                self._around += len(batch)
+                yield from self._look(batch)
 
     @property
     def looked(self) -> str:
         """Where the photo was looked for, in words; empty for nowhere."""
         views = [] if self._prior is None else ["at the prior"]
-        if self._prior is not None and self.views > 1:
-            views.append(f"in {self.views - 1} views around it")
+        if self._around:
+            views.append(f"in {self._around} views around it")
         if self.searched:
             views.append(f"in {self.searched} of {self._index_views} views of the map")
         return " and ".join(views)
