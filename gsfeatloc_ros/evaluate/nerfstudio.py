@@ -6,7 +6,6 @@ the top-left one at (0.5, 0.5); both are turned into this package's conventions 
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from gsfeatloc_ros.common.camera import Camera
+from gsfeatloc_ros.common.json_file import read_json
 from gsfeatloc_ros.evaluate.dataset import PosedPhoto
 
 
@@ -56,13 +56,13 @@ def naming(path: Path) -> Iterator[None]:
         raise ValueError(f"{path}: cannot be read: {error.strerror}") from error
     except KeyError as error:
         raise ValueError(f"{path}: lacks the key {error}") from error
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError, AttributeError) as error:
         raise ValueError(f"{path}: {error}") from error
 
 
 def read_transforms(path: Path) -> dict:
     """Read a transforms file."""
-    transforms = json.loads(path.read_text(encoding="utf-8"))
+    transforms = read_json(path)
     if not isinstance(transforms, dict):
         raise ValueError("is not a JSON object")
     return transforms

@@ -9,6 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from gsfeatloc_ros.common.memory import available_memory
+from gsfeatloc_ros.common.safe_files import open_regular
 from gsfeatloc_ros.maps.gaussian_map import GaussianMap, MapError, Reading
 from gsfeatloc_ros.maps.options import ReadOptions
 from gsfeatloc_ros.maps.similarity import Similarity
@@ -21,8 +23,14 @@ MAX_BLOCK_ROWS = 4096
 MAX_GAUSSIANS = 50_000_000
 # An .spz of SH degree 3 takes no more for each.
 MAX_PACKED_BYTES = 65 * MAX_GAUSSIANS
-# Packed Gaussians compress to a half or a third. What claims to unpack to so many times its size is no map.
-MAX_COMPRESSION_RATIO = 100
+# Packed Gaussians compress to a half or a third, those that are all alike further. What claims to unpack to more is no
+# map, unless it is so small that it does no harm.
+MAX_COMPRESSION_RATIO = 20
+_HARMLESS_BYTES = 1 << 18
+# Of the memory that is left, what a map may take: the rest is for the map in use, if there is one, and its renders.
+_MEMORY_SHARE = 0.8
+# What a Gaussian takes: in float32 here, as render/prepare.py prepares it, and its place in the order of drawing.
+_LOADED_BYTES, _COEFFICIENT_BYTES = 44 + 40 + 12, 12 + 6
 
 _ARRAYS = ("means", "scales", "rotations", "opacities", "sh")
 # With a larger share of rows that hold no Gaussian, a file is damaged or not what it seems.
@@ -75,8 +83,19 @@ def check_count(path: Path, count: int) -> None:
 
 def check_compression(path: Path, packed_size: int, file_size: int) -> None:
     """Refuse a claim of `packed_size` bytes compressed into a file of `file_size`, before memory is taken for them."""
-    if packed_size > MAX_COMPRESSION_RATIO * file_size:
+    if packed_size > max(MAX_COMPRESSION_RATIO * file_size, _HARMLESS_BYTES):
         raise MapError(f"{path}: is damaged: it claims {packed_size} bytes of Gaussians compressed to {file_size}")
+    check_memory(path, packed_size)
+
+
+def check_memory(path: Path, size: int) -> None:
+    """Refuse a map that takes `size` bytes where these are not to spare: it must not cost the one that is in use."""
+    available = available_memory()
+    if size > _MEMORY_SHARE * available:
+        raise MapError(
+            f"{path}: takes {1e-9 * size:.1f} GB of memory to load, and {1e-9 * available:.1f} GB are available: crop "
+            "or thin the map, or give this process more"
+        )
 
 
 def read_packed(path: Path, file: Path, limit: int = MAX_PACKED_BYTES) -> bytes:
@@ -84,7 +103,9 @@ def read_packed(path: Path, file: Path, limit: int = MAX_PACKED_BYTES) -> bytes:
     size = file.stat().st_size
     if size > limit:
         raise MapError(f"{path}: {file.name} of {size} bytes is too large; at most {limit} are read")
-    return file.read_bytes()
+    check_memory(path, size)
+    with open_regular(file) as stream:
+        return stream.read(size)
 
 
 def block_slices(count: int) -> Iterator[slice]:
@@ -106,10 +127,12 @@ def assemble(path: Path, layout: Layout, blocks: Iterable[Block], options: ReadO
     in S_map_splat.
 
     Raises:
-        MapError: more than 1 % of the rows would be left out, or positions are coarser than the Gaussians.
+        MapError: more than 1 % of the rows would be left out, positions are coarser than the Gaussians, or there is too
+            little memory.
     """
     count, sh_coefficients = layout.count, layout.sh_coefficients
     antialiased, antialiased_notes = _antialiased(layout, options)
+    check_memory(path, count * (_LOADED_BYTES + _COEFFICIENT_BYTES * sh_coefficients))
     gaussian_map = GaussianMap(
         means=np.empty((count, 3), np.float32),
         scales=np.empty((count, 3), np.float32),

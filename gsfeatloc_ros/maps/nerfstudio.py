@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
 
+from gsfeatloc_ros.common.json_file import read_json
 from gsfeatloc_ros.maps.gaussian_map import MapError
 from gsfeatloc_ros.maps.similarity import Similarity
 
@@ -21,12 +21,12 @@ def read_dataparser_transforms(path: str | Path) -> Similarity:
         MapError: the file cannot be read or holds no such transform.
     """
     try:
-        content = json.loads(Path(path).read_text(encoding="utf-8"))
+        content = read_json(Path(path))
         transform, scale = np.array(content["transform"], dtype=np.float64), float(content["scale"])
         if transform.shape != (3, 4):
             raise ValueError(f"its transform is of shape {transform.shape}, not (3, 4)")
         return Similarity(scale, transform[:, :3], scale * transform[:, 3]).inverse()
     except OSError as error:
-        raise MapError(f"{path}: cannot be read: {error.strerror}") from error
-    except (KeyError, TypeError, ValueError, RecursionError) as error:
+        raise MapError(f"{path}: cannot be read: {error.strerror or error}") from error
+    except (KeyError, TypeError, ValueError) as error:
         raise MapError(f"{path}: is not a dataparser_transforms.json of nerfstudio: {error}") from error

@@ -19,7 +19,6 @@ import cv2
 import numpy as np
 
 from gsfeatloc_ros.maps.assemble import (
-    MAX_COMPRESSION_RATIO,
     MAX_PACKED_BYTES,
     Block,
     Layout,
@@ -34,6 +33,8 @@ from gsfeatloc_ros.maps.options import ReadOptions
 
 # A meta.json with all codebooks takes 16 KB.
 _MAX_META_BYTES = 1 << 20
+# The list of the files in a zip, of which a .sog has 8.
+_MAX_DIRECTORY_BYTES = 1 << 16
 # Means, quaternions, scales, colour and opacity of a Gaussian, which hardly compress.
 _MIN_BYTES_PER_GAUSSIAN = 17
 # What zipfile raises on damage: the last two for features that it does not have and for passwords.
@@ -75,6 +76,7 @@ def read_sog(path: Path, options: ReadOptions) -> GaussianMap:
         OSError: it cannot be read.
     """
     try:
+        _check_directory(path)
         with zipfile.ZipFile(path) as archive:
             folder = _folder_of_meta(path, archive)
             meta_json = _read_member(path, archive, folder + "meta.json", _MAX_META_BYTES)
@@ -114,15 +116,26 @@ def _folder_of_meta(path: Path, archive: zipfile.ZipFile) -> str:
     return found[0]
 
 
+def _check_directory(path: Path) -> None:
+    """Refuse a zip of a million files: to list them takes hundreds of megabytes."""
+    with path.open("rb") as stream:
+        # zipfile has no public call for what stands at the end of a zip; `ZipFile` would read the whole list.
+        end = zipfile._EndRecData(stream)  # type: ignore[attr-defined]
+    if end and end[zipfile._ECD_SIZE] > _MAX_DIRECTORY_BYTES:  # type: ignore[attr-defined]
+        entries = end[zipfile._ECD_ENTRIES_TOTAL]  # type: ignore[attr-defined]
+        size = end[zipfile._ECD_SIZE]  # type: ignore[attr-defined]
+        raise MapError(f"{path}: is a zip of {entries} files in a list of {size} bytes, so no .sog")
+
+
 def _read_member(path: Path, archive: zipfile.ZipFile, name: str, limit: int = MAX_PACKED_BYTES) -> bytes:
     if name not in archive.namelist():
         raise MapError(f"{path}: is a .sog without {name}, so a damaged one")
     member = archive.getinfo(name)
     if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         raise MapError(f"{path}: {name} is compressed in a way that a .sog is not: zip it with deflate or without")
-    if member.file_size > min(limit, MAX_COMPRESSION_RATIO * member.compress_size):
-        size = f"{member.file_size} bytes of {member.compress_size}"
-        raise MapError(f"{path}: is damaged: {name} claims {size}, which is too many for a .sog")
+    if member.file_size > limit:
+        raise MapError(f"{path}: is damaged: {name} claims {member.file_size} bytes, which is too many for a .sog")
+    check_compression(path, member.file_size, member.compress_size)
     return archive.read(member)
 
 
@@ -275,11 +288,15 @@ def _decode_palette(path: Path, sog: _Sog, data: bytes) -> np.ndarray:
 
 def _decode_webp(path: Path, name: str, data: bytes, min_pixels: int, max_pixels: int) -> np.ndarray:
     """Decode the pixels (H, W, 4) uint8 RGBA of a lossless WebP; look up its size before memory is taken for it."""
-    width, height = _webp_size(path, name, data)
+    lossless = _lossless_chunk(path, name, data)
+    bits = int.from_bytes(lossless[9:13], "little")
+    width, height = 1 + (bits & 0x3FFF), 1 + (bits >> 14 & 0x3FFF)
     if not min_pixels <= width * height <= max_pixels:
         raise MapError(f"{path}: {name} of {width} x {height} pixels does not fit the number of Gaussians")
+    # The decoder is given nothing but what the size was read from: other chunks may tell of another.
+    simple = b"RIFF" + (4 + len(lossless)).to_bytes(4, "little") + b"WEBP" + lossless
     try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        image = cv2.imdecode(np.frombuffer(simple, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
         image = None
     if image is None or image.shape[:2] != (height, width) or image.shape[2:] not in ((3,), (4,)):
@@ -287,17 +304,17 @@ def _decode_webp(path: Path, name: str, data: bytes, min_pixels: int, max_pixels
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGBA if image.shape[2] == 3 else cv2.COLOR_BGRA2RGBA)
 
 
-def _webp_size(path: Path, name: str, data: bytes) -> tuple[int, int]:
-    """Return width and height of the first lossless image among the chunks of a file (RFC 9649, 2.3 and 3.4)."""
+def _lossless_chunk(path: Path, name: str, data: bytes) -> bytes:
+    """Return the first lossless image among the chunks of a file (RFC 9649, 2.3 and 3.4)."""
     if data[:4] != b"RIFF" or data[8:12] != b"WEBP":
         raise MapError(f"{path}: {name} is not a WebP image")
     start = 12
     while start + 13 <= len(data):
-        kind, size = data[start : start + 4], int.from_bytes(data[start + 4 : start + 8], "little")
-        if kind == b"VP8L":
-            bits = int.from_bytes(data[start + 9 : start + 13], "little")
-            return 1 + (bits & 0x3FFF), 1 + (bits >> 14 & 0x3FFF)
-        start += 8 + size + size % 2
+        end = start + 8 + int.from_bytes(data[start + 4 : start + 8], "little")
+        end += end % 2
+        if data[start : start + 4] == b"VP8L":
+            return data[start:end]
+        start = end
     raise MapError(f"{path}: {name} is truncated or a lossy or animated WebP, whose pixels are not the map's values")
 
 

@@ -29,7 +29,7 @@ from map_files import (
     write_spz,
 )
 
-from gsfeatloc_ros.maps import GaussianMap, MapError, load_map
+from gsfeatloc_ros.maps import GaussianMap, MapError, assemble, load_map
 from gsfeatloc_ros.maps.assemble import MAX_GAUSSIANS
 
 # tmp_path is shared by the examples of one test: each overwrites the files.
@@ -409,6 +409,50 @@ def test_zip_bomb(tmp_path):
     with zipfile.ZipFile(tmp_path / "map.sog", "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("meta.json", b" " * 50_000_000)
     refused(tmp_path / "map.sog", "claims 50000000 bytes")
+
+
+def test_zip_of_very_many_files(tmp_path):
+    """To list a million takes 400 MB, and the list is not what the end of the zip says of it."""
+    with zipfile.ZipFile(tmp_path / "map.sog", "w") as archive:
+        archive.writestr("meta.json", b"{}")
+    content = (tmp_path / "map.sog").read_bytes()
+    start = content.index(b"PK\x01\x02")
+    end = content.index(b"PK\x05\x06")
+    entries = 20_000 * content[start:end]
+    tail = content[end : end + 12] + struct.pack("<I", len(entries)) + content[end + 16 :]
+    (tmp_path / "map.sog").write_bytes(content[:start] + entries + tail)
+    refused(tmp_path / "map.sog", "is a zip of 1 files in a list of 1100000 bytes, so no .sog")
+
+
+def test_webp_of_another_canvas_than_its_picture(tmp_path):
+    """The decoder would take memory for the canvas: it is given the picture alone."""
+    folder = write_sog(tmp_path / "sog", sample_map(10, 0, 0), 2)
+    expected = load_map(folder)
+    image = (folder / "quats.webp").read_bytes()
+    canvas = b"VP8X" + struct.pack("<II", 10, 0x10) + 2 * (16_000).to_bytes(3, "little")
+    chunks = b"WEBP" + canvas + image[12:]
+    (folder / "quats.webp").write_bytes(b"RIFF" + struct.pack("<I", len(chunks)) + chunks)
+    np.testing.assert_array_equal(load_map(folder).rotations, expected.rotations)
+
+
+@pytest.mark.parametrize("version", [2, 4])
+def test_a_map_that_expands_by_hundreds(tmp_path, version):
+    written = sample_map(100, 3, 0)
+    path = write_spz(tmp_path / "map", written, version)
+    content = bytearray(path.read_bytes() if version == 4 else gzip.decompress(path.read_bytes()))
+    content[8:12] = struct.pack("<I", 50_000)
+    path.write_bytes(content if version == 4 else gzip.compress(bytes(content)))
+    refused(path, r"is damaged: it claims 32\d0000 bytes of Gaussians compressed to")
+
+
+@pytest.mark.parametrize("available", [0, 20_000, 39_000])
+def test_a_map_that_takes_more_memory_than_there_is(tmp_path, monkeypatch, available):
+    """400 Gaussians take 46 kB while they are prepared, and a fifth stays for others."""
+    path = write_splat(tmp_path / "map", sample_map(400, 0, 0))
+    monkeypatch.setattr(assemble, "available_memory", lambda: available)
+    refused(path, r"takes 0.0 GB of memory to load, and 0.0 GB are available")
+    monkeypatch.setattr(assemble, "available_memory", lambda: 60_000)
+    assert len(load_map(path)) == 400
 
 
 @pytest.mark.parametrize("method", [zipfile.ZIP_LZMA, zipfile.ZIP_BZIP2])

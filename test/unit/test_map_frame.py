@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from dataclasses import replace
 
 import numpy as np
@@ -202,6 +203,22 @@ def test_other_files_than_nerfstudios_transforms_are_refused(tmp_path, content, 
     with pytest.raises(MapError, match=match) as error:
         read_dataparser_transforms(path)
     assert str(path) in str(error.value)
+
+
+@pytest.mark.parametrize("digits", [19, 400, 5000])
+def test_a_number_of_very_many_digits_is_refused(tmp_path, digits):
+    """Python's whole numbers have no end, floats do; that ended the node without a word."""
+    path = tmp_path / "dataparser_transforms.json"
+    content = {"transform": np.eye(4)[:3].tolist(), "scale": 1.0}
+    path.write_text(json.dumps(content).replace("0.0", digits * "9", 1))
+    with pytest.raises(MapError, match="is not a dataparser_transforms.json"):
+        read_dataparser_transforms(path)
+
+
+def test_transforms_in_a_pipe_are_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "transforms.json")
+    with pytest.raises(MapError, match="is not a regular file"):
+        read_dataparser_transforms(tmp_path / "transforms.json")
 
 
 def test_missing_transforms(tmp_path):
