@@ -7,13 +7,17 @@ name is for testing and the others have made the map.
 
 from __future__ import annotations
 
+import copy
+import tempfile
 from pathlib import Path
-from typing import Any
+from types import ModuleType
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.geometry import invert, make_pose
+from gsfeatloc_ros.evaluate.colmap_files import copy_without_points
 from gsfeatloc_ros.evaluate.dataset import PosedPhoto
 from gsfeatloc_ros.evaluate.extras import import_extra
 
@@ -40,25 +44,55 @@ def load(folder: Path) -> tuple[list[PosedPhoto], np.ndarray]:
     pycolmap = import_extra("pycolmap")
     path = folder / "sparse" / "0"
     try:
-        model = pycolmap.Reconstruction(str(path))
-    except (ValueError, RuntimeError) as error:
-        raise ValueError(f"{path}: is not a COLMAP model: {error}") from error
-    images = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)
+        images = _registered(pycolmap, path)
+    except OSError as error:
+        raise ValueError(f"{path}: is not a COLMAP model: {error.strerror or error}") from error
+    # pycolmap passes on whatever the standard library of C++ raises.
+    except (ValueError, RuntimeError, LookupError, ArithmeticError, MemoryError) as error:
+        raise ValueError(f"{path}: is not a COLMAP model: {error or type(error).__name__}") from error
     if not images:
         raise ValueError(f"{path}: holds no registered image")
     cameras = {}
     photos = []
     for image in images[::_TEST_EVERY]:
-        if image.camera_id not in cameras:
-            cameras[image.camera_id] = _camera(path, image.camera)
+        if image.camera.camera_id not in cameras:
+            cameras[image.camera.camera_id] = _camera(path, image.camera)
         file = folder / "images" / image.name
-        photos.append(PosedPhoto(file.name, file, cameras[image.camera_id], _pose(image)))
-    return photos, np.array([_pose(image) for image in images])
+        photos.append(PosedPhoto(file.name, file, cameras[image.camera.camera_id], image.T_map_camera))
+    return photos, np.array([image.T_map_camera for image in images])
+
+
+class _Image(NamedTuple):
+    """A photo that COLMAP registered, taken by a pycolmap.Camera."""
+
+    name: str
+    camera: Any
+    T_map_camera: np.ndarray
+
+
+def _registered(pycolmap: ModuleType, path: Path) -> list[_Image]:
+    """Return the registered images of a model by name."""
+
+    def parameters(model: int) -> int:
+        return len(pycolmap.Camera.create_from_model_id(0, pycolmap.CameraModelId(model), 1.0, 1, 1).params)
+
+    with tempfile.TemporaryDirectory() as folder:
+        copy_without_points(path, Path(folder), parameters)
+        model = pycolmap.Reconstruction(folder)
+    # The model's own cameras are gone with it.
+    images = [
+        _Image(image.name, copy.copy(image.camera), _pose(image))
+        for image in model.images.values()
+        if image.has_pose
+    ]
+    return sorted(images, key=lambda image: image.name)
 
 
 def _pose(image: Any) -> np.ndarray:
     """Return T_map_camera (4, 4) of a pycolmap.Image."""
     T_camera_map = image.cam_from_world().matrix()
+    if not np.isfinite(T_camera_map).all():
+        raise ValueError(f"the pose of {image.name} is not finite")
     return invert(make_pose(T_camera_map[:, :3], T_camera_map[:, 3]))
 
 

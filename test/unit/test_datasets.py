@@ -11,6 +11,7 @@ from room_datasets import angle_x, colmap_camera, save_image, write_colmap, writ
 
 from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.geometry import make_pose, rotation_error_deg, translation_error
+from gsfeatloc_ros.evaluate import colmap
 from gsfeatloc_ros.evaluate.protocol import trajectory_radius
 from gsfeatloc_ros.evaluate.scene import load_scene
 from gsfeatloc_ros.localize.localizer import Localizer
@@ -336,6 +337,35 @@ def test_colmap_model_that_cannot_be_read(tmp_path, kind):
             (folder / f"{name}.bin").write_bytes(b"xx")
     with pytest.raises(ValueError, match="sparse/0: is not a COLMAP model"):
         load_scene(tmp_path, "map.ply")
+
+
+@pytest.mark.parametrize("name", ["cameras", "images", "rigs", "frames"])
+@pytest.mark.parametrize("count", [2, 10**6, 2**63, 2**64 - 1])
+def test_colmap_counts_that_lie_are_refused_before_pycolmap_sees_them(tmp_path, monkeypatch, name, count):
+    """It would take the memory, or read on for hours."""
+    write_colmap(tmp_path, [("PINHOLE", 8, 6, [4, 4, 4, 3])], [("a.png", 0, np.eye(4))])
+    file = tmp_path / f"sparse/0/{name}.bin"
+    file.write_bytes(count.to_bytes(8, "little") + file.read_bytes()[8:])
+    monkeypatch.setattr(pycolmap, "Reconstruction", lambda path: pytest.fail("pycolmap sees it"))
+    with pytest.raises(ValueError, match=rf"not a COLMAP model: {name}.bin (claims|is truncated)"):
+        load_scene(tmp_path, "map.ply")
+
+
+def test_colmap_points_are_not_read(tmp_path):
+    """Neither those of the model nor those in the photos, of which there may be millions; here they are a lie."""
+    images = [(f"{name}.png", 0, np.eye(4)) for name in "ab"]
+    write_colmap(tmp_path, [("PINHOLE", 8, 6, [4, 4, 4, 3])], images)
+    (tmp_path / "sparse/0/points3D.bin").write_bytes(b"\xff" * 100)
+    file = tmp_path / "sparse/0/images.bin"
+    content = file.read_bytes()
+    end = content.index(b"a.png\0") + 6
+    points = (3).to_bytes(8, "little") + 3 * 24 * b"\xff"
+    file.write_bytes(content[:end] + points + content[end + 8 :])
+    _, poses = colmap.load(tmp_path)
+    np.testing.assert_allclose(poses, [np.eye(4)] * 2)
+    file.write_bytes(content[:end] + (2**61).to_bytes(8, "little") + content[end + 8 :])
+    with pytest.raises(ValueError, match="claims 2305843009213693952 entries"):
+        colmap.load(tmp_path)
 
 
 def test_colmap_without_pycolmap(tmp_path, monkeypatch):

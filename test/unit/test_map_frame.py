@@ -211,7 +211,7 @@ def test_a_number_of_very_many_digits_is_refused(tmp_path, digits):
     path = tmp_path / "dataparser_transforms.json"
     content = {"transform": np.eye(4)[:3].tolist(), "scale": 1.0}
     path.write_text(json.dumps(content).replace("0.0", digits * "9", 1))
-    with pytest.raises(MapError, match="is not a dataparser_transforms.json"):
+    with pytest.raises(MapError, match="is not a dataparser_transforms"):
         read_dataparser_transforms(path)
 
 
