@@ -1,7 +1,7 @@
 # Every target does its own set-up (scripts/setup.sh).
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
-.PHONY: help demo test nightly unit node real gpu gsplat lint build setup clean
+.PHONY: help demo test nightly unit node real gpu gsplat fuzz lint build setup clean
 
 help:
 	@echo "make demo   localize a camera in a made-up room, from start to end"
@@ -12,6 +12,7 @@ help:
 	@echo "make real   test with real maps and scenes, where they are (test/real/README.md)"
 	@echo "make gpu    test the code for GPUs; without a GPU, on a simulated one"
 	@echo "make gsplat test the GPU renderer with gsplat's own kernels, compiled for the CPU"
+	@echo "make fuzz   feed damaged files and messages to what reads them, for ten minutes"
 	@echo "make lint   check the style and the types of the code"
 	@echo "make build  build with colcon, into install/"
 	@echo "make clean  remove what the others made, but for .venv"
@@ -41,6 +42,9 @@ node: build
 gsplat: build
 	@. scripts/env.sh && python -m pip install --quiet --upgrade --no-deps --target .venv/gsplat gsplat==1.5.3 jaxtyping wadler-lindig
 	@. scripts/env.sh && GSPLAT_ON_CPU=.venv/gsplat python -P -m pytest test/gpu/test_gpu.py
+
+fuzz: build
+	@. scripts/env.sh && python -P scripts/fuzz.py $(ARGS)
 
 lint: setup
 	@. scripts/env.sh && ruff check . && ruff format --check . && mypy

@@ -81,9 +81,7 @@ def _registered(pycolmap: ModuleType, path: Path) -> list[_Image]:
         model = pycolmap.Reconstruction(folder)
     # The model's own cameras are gone with it.
     images = [
-        _Image(image.name, copy.copy(image.camera), _pose(image))
-        for image in model.images.values()
-        if image.has_pose
+        _Image(image.name, copy.copy(image.camera), _pose(image)) for image in model.images.values() if image.has_pose
     ]
     return sorted(images, key=lambda image: image.name)
 
