@@ -29,7 +29,7 @@ class _Reader:
         self._stream = stream
         self._size = os.fstat(stream.fileno()).st_size
 
-    def bytes(self, count: int) -> bytes:
+    def take(self, count: int) -> bytes:
         """Return so many bytes, and go on behind them."""
         if count > self._size - self._stream.tell():
             raise ValueError("is truncated, or claims more than it holds")
@@ -37,7 +37,7 @@ class _Reader:
 
     def number(self, format: str) -> int:
         """Return a number."""
-        return struct.unpack(f"<{format}", self.bytes(struct.calcsize(f"<{format}")))[0]
+        return struct.unpack(f"<{format}", self.take(struct.calcsize(f"<{format}")))[0]
 
     def count(self, least: int) -> int:
         """Return a number of things that take at least so many bytes each."""
@@ -127,7 +127,7 @@ def _copy_images(reader: _Reader, copy: BinaryIO) -> None:
     count = reader.count(4 + _POSE_BYTES + 4 + 1 + 8)
     copy.write(struct.pack("<Q", count))
     for _ in range(count):
-        copy.write(reader.bytes(4 + _POSE_BYTES + 4))
+        copy.write(reader.take(4 + _POSE_BYTES + 4))
         copy.write(reader.name())
         reader.skip(reader.number("Q"), 24)
         copy.write(_NO_POINTS)

@@ -74,6 +74,8 @@ _MAGICS: tuple[tuple[int, bytes, str], ...] = (
 HEAD_BYTES = 262
 # Of a .ksplat the first bytes are a version of 0.1 or later and counts; it has no magic number.
 _KSPLAT_HEADER_BYTES = 4096
+# Of the list of files in a zip: of a .sog it takes 500.
+_MAX_DIRECTORY_BYTES = 1 << 17
 
 
 def refuse_foreign(path: Path, head: bytes) -> None:
@@ -95,6 +97,7 @@ def refuse_foreign_gzip(path: Path, head: bytes) -> None:
 
 def refuse_foreign_zip(path: Path) -> None:
     """Refuse a zip of another kind than a .sog by its name; raise what zipfile does for a damaged one."""
+    _check_zip_directory(path)
     with zipfile.ZipFile(path) as archive:
         names = [name for name in archive.namelist() if "__MACOSX/" not in name]
     base_names = {name.rpartition("/")[2] for name in names}
@@ -112,6 +115,17 @@ def refuse_foreign_zip(path: Path) -> None:
     if maps := [name for name in names if name.lower().endswith((".ply", ".spz", ".splat", ".sog", ".ksplat"))]:
         raise MapError(f"{path}: is packed (zip), with {maps[0]} in it: {_UNPACK}")
     raise MapError(f"{path}: is a zip without meta.json, so no .sog: {_NO_MAP}")
+
+
+def _check_zip_directory(path: Path) -> None:
+    """Refuse a zip of a million files: to list them takes hundreds of megabytes, and a minute."""
+    with path.open("rb") as stream:
+        # zipfile has no public call for what stands at the end of a zip; `ZipFile` would read the whole list.
+        end = zipfile._EndRecData(stream)  # type: ignore[attr-defined]
+    if end and end[zipfile._ECD_SIZE] > _MAX_DIRECTORY_BYTES:  # type: ignore[attr-defined]
+        entries = end[zipfile._ECD_ENTRIES_TOTAL]  # type: ignore[attr-defined]
+        size = end[zipfile._ECD_SIZE]  # type: ignore[attr-defined]
+        raise MapError(f"{path}: is a zip of {entries} files in a list of {size} bytes, so no .sog: {_NO_MAP}")
 
 
 def refuse_foreign_json(path: Path, content: Any) -> None:

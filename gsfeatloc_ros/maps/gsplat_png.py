@@ -15,6 +15,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from gsfeatloc_ros.common.jpeg_png import read_header
 from gsfeatloc_ros.maps.assemble import (
     MAX_COMPRESSION_RATIO,
     Block,
@@ -89,7 +90,7 @@ def _image(path: Path, name: str, count: int) -> np.ndarray:
     if side * side != count or data[16:24] != side.to_bytes(4, "big") * 2 or count > MAX_COMPRESSION_RATIO * len(data):
         raise MapError(f"{path}: {file.name} does not have the {count} pixels of a square that meta.json says")
     try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        image = cv2.imdecode(np.frombuffer(read_header(data).data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
         image = None
     if image is None or image.dtype != np.uint8 or image.shape[:2] != (side, side):

@@ -33,8 +33,6 @@ from gsfeatloc_ros.maps.options import ReadOptions
 
 # A meta.json with all codebooks takes 16 KB.
 _MAX_META_BYTES = 1 << 20
-# The list of the files in a zip, of which a .sog has 8.
-_MAX_DIRECTORY_BYTES = 1 << 16
 # Means, quaternions, scales, colour and opacity of a Gaussian, which hardly compress.
 _MIN_BYTES_PER_GAUSSIAN = 17
 # What zipfile raises on damage: the last two for features that it does not have and for passwords.
@@ -76,7 +74,6 @@ def read_sog(path: Path, options: ReadOptions) -> GaussianMap:
         OSError: it cannot be read.
     """
     try:
-        _check_directory(path)
         with zipfile.ZipFile(path) as archive:
             folder = _folder_of_meta(path, archive)
             meta_json = _read_member(path, archive, folder + "meta.json", _MAX_META_BYTES)
@@ -114,17 +111,6 @@ def _folder_of_meta(path: Path, archive: zipfile.ZipFile) -> str:
     if len(found) != 1:
         raise MapError(f"{path}: is a zip with {len(found)} meta.json, so no .sog or a damaged one")
     return found[0]
-
-
-def _check_directory(path: Path) -> None:
-    """Refuse a zip of a million files: to list them takes hundreds of megabytes."""
-    with path.open("rb") as stream:
-        # zipfile has no public call for what stands at the end of a zip; `ZipFile` would read the whole list.
-        end = zipfile._EndRecData(stream)  # type: ignore[attr-defined]
-    if end and end[zipfile._ECD_SIZE] > _MAX_DIRECTORY_BYTES:  # type: ignore[attr-defined]
-        entries = end[zipfile._ECD_ENTRIES_TOTAL]  # type: ignore[attr-defined]
-        size = end[zipfile._ECD_SIZE]  # type: ignore[attr-defined]
-        raise MapError(f"{path}: is a zip of {entries} files in a list of {size} bytes, so no .sog")
 
 
 def _read_member(path: Path, archive: zipfile.ZipFile, name: str, limit: int = MAX_PACKED_BYTES) -> bytes:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from gsfeatloc_ros.common.geometry import make_pose, matrix_from_quaternion
-from gsfeatloc_ros.ros_io.jpeg_png import decode, read_header
+from gsfeatloc_ros.common.jpeg_png import decode, read_header
 from gsfeatloc_ros.ros_io.message_types import (
     AnyImage,
     AnyPose,

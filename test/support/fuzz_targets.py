@@ -26,6 +26,7 @@ from rosbags.typesys import Stores, get_typestore
 from view_indices import made_up_index
 
 from gsfeatloc_ros.common.camera import Camera
+from gsfeatloc_ros.common.jpeg_png import decode, read_header
 from gsfeatloc_ros.evaluate import colmap, nerfstudio
 from gsfeatloc_ros.index import storage
 from gsfeatloc_ros.index.storage import load_index, save_index
@@ -36,7 +37,6 @@ from gsfeatloc_ros.render.prepare import PreparedMap
 from gsfeatloc_ros.replay.bag import Role, open_bag
 from gsfeatloc_ros.ros_io.calibration import decode_camera
 from gsfeatloc_ros.ros_io.decode import decode_pose
-from gsfeatloc_ros.ros_io.jpeg_png import decode, read_header
 from gsfeatloc_ros.ros_io.raw_image import decode_image
 from gsfeatloc_ros.ros_io.saved_pose import load_pose, save_pose
 
@@ -188,11 +188,11 @@ def _read_message(kind: str, take: Callable[[Any], Any]) -> Callable[[Path], Any
 def _bags(folder: Path) -> dict[str, Target]:
     found = {}
     messages = [("/image", bags.image(1.0 + number, np.zeros((6, 8, 3), np.uint8))) for number in range(3)]
-    for storage in (StoragePlugin.MCAP, StoragePlugin.SQLITE3):
-        path = folder / f"bag_{storage.name}"
-        bags.write_messages(path, messages, storage)
+    for plugin in (StoragePlugin.MCAP, StoragePlugin.SQLITE3):
+        path = folder / f"bag_{plugin.name}"
+        bags.write_messages(path, messages, plugin)
         for file in sorted(path.iterdir()):
-            found[f"bag {storage.name.lower()} {file.suffix}"] = Target([file.read_bytes()], _read_bag(path, file))
+            found[f"bag {plugin.name.lower()} {file.suffix}"] = Target([file.read_bytes()], _read_bag(path, file))
     return found
 
 

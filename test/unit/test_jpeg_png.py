@@ -13,8 +13,8 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from picture_files import jpeg_with_hidden_size, png, png_chunk
 
-from gsfeatloc_ros.ros_io import jpeg_png
-from gsfeatloc_ros.ros_io.jpeg_png import MAX_PIXELS, decode, read_header
+from gsfeatloc_ros.common import jpeg_png
+from gsfeatloc_ros.common.jpeg_png import MAX_PIXELS, decode, read_header
 
 RGB = np.random.default_rng(0).integers(0, 256, (48, 64, 3), np.uint8)
 
