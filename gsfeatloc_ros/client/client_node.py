@@ -37,9 +37,9 @@ class ClientNode:
             self.spin_once()
         return True
 
-    def spin_once(self) -> None:
-        """Take a message, if one comes soon."""
-        self._executor.spin_once(timeout_sec=0.05)
+    def spin_once(self, timeout: float = 0.05) -> None:
+        """Take a message, if one comes within `timeout` seconds."""
+        self._executor.spin_once(timeout_sec=timeout)
 
     def spin(self, seconds: float) -> None:
         """Take messages for so long."""

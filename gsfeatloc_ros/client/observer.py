@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -18,6 +18,7 @@ from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from std_srvs.srv import Trigger
 
 from gsfeatloc_ros.client.client_node import ClientNode
+from gsfeatloc_ros.client.flood import FloodProcess
 from gsfeatloc_ros.client.messages import (
     camera_info_of,
     pose_matrix,
@@ -147,13 +148,22 @@ class Observer(ClientNode):
         self._due, self._called = 0.0, 0
         self._future: rclpy.Future | None = None
 
-    def watch(self, pid: int, robot: BaseProcess) -> None:
-        """Take all in until the robot has ended and the last request is answered; `pid` is the localizer's."""
+    def watch(self, pid: int, robot: BaseProcess, floods: Sequence[FloodProcess] = ()) -> None:
+        """Take all in until the robot and the floods have ended and the last request is answered.
+
+        Args:
+            pid: of the localizer's process.
+            robot: that was started.
+            floods: to be sent meanwhile.
+        """
         self.spin_until(lambda: bool(self.record.sent) or not robot.is_alive(), float("inf"))
         start, next_sample = time.monotonic(), 0.0
         self._due = start + _CALL_PERIOD
-        while robot.is_alive():
+        over = False
+        while robot.is_alive() or not over:
             seconds = time.monotonic() - start
+            # Each of them, also when one is not over.
+            over = sum(not flood.step(seconds) for flood in floods) == 0
             if seconds >= next_sample:
                 self.record.samples.append(Sample.of(pid, seconds))
                 next_sample += _SAMPLE_PERIOD

@@ -53,12 +53,21 @@ class LocalizerProcess:
     Args:
         arguments: its command line, as of node_arguments().
         log: file that takes what it prints; a temporary one by default.
+        environment: changes of this process's; None takes a variable out.
     """
 
-    def __init__(self, arguments: Sequence[str], log: Path | None = None) -> None:
+    def __init__(
+        self, arguments: Sequence[str], log: Path | None = None, environment: Mapping[str, str | None] | None = None
+    ) -> None:
         self._log = tempfile.TemporaryFile() if log is None else log.open("w+b")  # noqa: SIM115 - see close()
         self._last_output = ""
-        self._process = subprocess.Popen([executable(), *arguments], stdout=self._log, stderr=subprocess.STDOUT)
+        changed: dict[str, str | None] = {**os.environ, **(environment or {})}
+        self._process = subprocess.Popen(
+            [executable(), *arguments],
+            stdout=self._log,
+            stderr=subprocess.STDOUT,
+            env={name: value for name, value in changed.items() if value is not None},
+        )
 
     @property
     def output(self) -> str:

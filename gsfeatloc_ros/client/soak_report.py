@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from gsfeatloc_ros.client.flood import Flood, FloodReply, summarize_flood
 from gsfeatloc_ros.client.observer import Call, Sample, SoakRecord
 from gsfeatloc_ros.client.score import MAX_ROTATION_ERROR_DEG, MAX_TRANSLATION_ERROR, pose_error
 
@@ -18,6 +19,8 @@ _BLOCKS = 12
 _MIN_RECEPTION = 0.95
 _MAX_LATENCY = 1.5
 _MAX_GROWTH, _MAX_RISE = 0.1, 0.05
+# With a flood: megabytes that are resident at most, and the share of its quiet rate that the stream keeps at least.
+_MAX_FLOOD_MEMORY, _MIN_STREAM_SHARE = 700.0, 0.3
 
 
 def growth(samples: list[Sample]) -> float:
@@ -48,10 +51,13 @@ def summarize_calls(calls: list[Call], typical: float) -> dict[str, float]:
         "times_95_percent": np.percentile(latency, 95) / typical,
         "times_max": np.max(latency) / typical,
     }
-    if not np.isnan(work).any():
+    # Where it is told, and there was any.
+    worked = work > 0
+    if worked.any():
         # Beyond the localization itself: waiting, and the way there and back.
-        beside = {"ms_beside_work_median": np.median(latency - work), "ms_beside_work_max": np.max(latency - work)}
-        figures |= beside | {"times_own_work_95_percent": np.percentile(latency / work, 95)}
+        beside = (latency - work)[worked]
+        figures |= {"ms_beside_work_median": np.median(beside), "ms_beside_work_max": np.max(beside)}
+        figures |= {"times_own_work_95_percent": np.percentile((latency / work)[worked], 95)}
     counts = {"calls": len(calls), "with_pose": sum(call.success for call in calls)}
     return counts | {name: round(float(value), 2) for name, value in figures.items()}
 
@@ -109,4 +115,32 @@ def summarize(record: SoakRecord, seconds: float) -> dict[str, Any]:
                 for service in services.values()
             ),
         },
+    }
+
+
+def add_floods(result: dict[str, Any], record: SoakRecord, floods: list[tuple[Flood, list[FloodReply]]]) -> None:
+    """Add to the figures how floods were answered, and what became of the stream meanwhile.
+
+    Where all wait for each other, the services' own latencies are no target.
+    """
+    answered = np.sort([float(stamp) for stamp in record.answers])
+    quiet = answered[answered < min(reply.sent for _, replies in floods for reply in replies)]
+    quiet_rate = (len(quiet) - 1) / (quiet[-1] - quiet[0])
+    result["floods"] = []
+    for flood, replies in floods:
+        # It lasts from its first request to its last reply.
+        start = min(reply.sent for reply in replies)
+        end = max(reply.sent + np.nan_to_num(1e-3 * reply.latency) for reply in replies)
+        rate = np.count_nonzero((answered >= start) & (answered <= end)) / (end - start)
+        figures = {"seconds": end - start, "stream_rate_quiet": quiet_rate, "stream_rate": rate}
+        figures |= {"stream_share": rate / quiet_rate}
+        rounded = {name: round(float(value), 3) for name, value in figures.items()}
+        result["floods"].append(summarize_flood(flood, replies) | rounded)
+    result["memory_mb_max"] = round(max(sample.memory for sample in record.samples), 1)
+    del result["targets"]["services answer in time"]
+    result["targets"] |= {
+        "every request is answered": record.unanswered == 0
+        and all(figures["unanswered"] == 0 for figures in result["floods"]),
+        "the stream goes on": all(figures["stream_share"] >= _MIN_STREAM_SHARE for figures in result["floods"]),
+        "memory is bounded": result["memory_mb_max"] <= _MAX_FLOOD_MEMORY,
     }

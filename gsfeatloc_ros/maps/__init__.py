@@ -40,6 +40,8 @@ __all__ = [
 _DEFAULT_OPTIONS = ReadOptions()
 # The tree of a streamed .sog takes more than all else.
 _MAX_JSON_BYTES = 1 << 26
+# Of the most opaque Gaussian: what is fainter is drawn by no renderer (MIN_ALPHA in render/base.py).
+_MIN_OPACITY = 1.0 / 255.0
 
 
 def load_map(
@@ -65,6 +67,12 @@ def load_map(
         raise MapError(f"{path}: cannot be read: {error.strerror or error}") from error
     except MemoryError as error:
         raise MapError(f"{path}: does not fit into this machine's memory: crop or thin the map") from error
+    most = float(gaussian_map.opacities.max(initial=0.0))
+    if most < _MIN_OPACITY:
+        raise MapError(
+            f"{path}: nothing in it can be seen: none of its {len(gaussian_map.opacities)} Gaussians has an opacity of "
+            f"more than {most:.2g}; was its training, or its export, broken off?"
+        )
     if path.is_dir():
         gaussian_map = gaussian_map.with_note(f"of the folder, {found.relative_to(path)} is read")
     return gaussian_map if alignment is None else gaussian_map.placed(alignment)

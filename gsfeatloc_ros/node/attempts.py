@@ -22,12 +22,13 @@ from gsfeatloc_ros.node.pose_file import PoseFile
 from gsfeatloc_ros.node.publishers import Answer, Publishers
 from gsfeatloc_ros.node.report import Report
 from gsfeatloc_ros.node.standing import StandingPublisher
-from gsfeatloc_ros.node.worker import Worker
+from gsfeatloc_ros.node.worker import QueueLimits, Terms, Worker
 from gsfeatloc_ros.ros_io.extrinsics import Extrinsics
 from gsfeatloc_ros.ros_io.follower import Follower
-from gsfeatloc_ros.ros_io.inputs import LocalizerInput
+from gsfeatloc_ros.ros_io.inputs import LocalizerInput, NewestInputs
 from gsfeatloc_ros.ros_io.outcome import Outcome
 from gsfeatloc_ros.ros_io.prior import Prior
+from gsfeatloc_ros.ros_io.settings import RequestSettings
 from gsfeatloc_ros.ros_io.state import Decision, State
 
 
@@ -39,6 +40,7 @@ class Job:
         message: the image.
         camera: of the image; None for that of the newest camera_info.
         prior: where it was taken; None for the newest.
+        inputs: the newest camera_info and prior when it was asked for; None for those when the work on it begins.
         shared: whether the answer is for all, on the topics, or only for the one who asks.
         kept: whether, asked for by one alone, it is gone on from all the same.
         max_seconds: that the search may take; 0 for what the options say.
@@ -47,9 +49,20 @@ class Job:
     message: Image | CompressedImage
     camera: Camera | None = None
     prior: Prior | None = None
+    inputs: NewestInputs | None = None
     shared: bool = True
     kept: bool = True
     max_seconds: float = 0.0
+
+    def same(self, other: Job) -> bool:
+        """Return whether this is the same image, asked for with the same camera_info and prior; if it is for all.
+
+        One that is worked on anyway counts as well, with the newest that there were when that began.
+        """
+        if not (self.shared and other.shared and self.message is other.message):
+            return False
+        a, b = self.inputs, other.inputs
+        return a is None or b is None or (a.camera is b.camera and a.prior is b.prior)
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +115,7 @@ class Attempts:
         self._engine, self._follower, self._outputs = engine, follower, outputs
         self._engine_lock = Lock()
         self.publishing = False
-        self._worker: Worker[Job, JobResult] = Worker(self._attempt)
+        self._worker: Worker[Job, JobResult] = Worker(self._attempt, Job.same)
 
     @property
     def engine(self) -> Engine:
@@ -118,9 +131,39 @@ class Attempts:
         """Do a job when nothing is requested, unless a newer one is offered by then."""
         self._worker.offer(job)
 
-    def request(self, job: Job) -> Future[JobResult]:
-        """Do a job in any case, before all that is offered; the Future is cancelled when the worker stops first."""
-        return self._worker.request(job)
+    @property
+    def busy_seconds(self) -> float:
+        """For how long the running localization has taken; 0 for none."""
+        return self._worker.busy_seconds
+
+    @property
+    def waiting(self) -> int:
+        """Number of requests that wait."""
+        return self._worker.waiting
+
+    @property
+    def unserved(self) -> int:
+        """Number of requests that were told that it is busy."""
+        return self._worker.unserved
+
+    def request(self, job: Job, settings: RequestSettings, wanted: Callable[[], bool]) -> Future[JobResult]:
+        """Do a job before those that are offered, if there is room in the queue.
+
+        The Future raises UnservedError where it is not done in time, and is cancelled when the worker stops first.
+
+        Args:
+            job: to be done.
+            settings: of the queue.
+            wanted: returns whether anybody waits for it still.
+        """
+        self._worker.limits = QueueLimits(settings.max_waiting, int(1e6 * settings.max_megabytes))
+        # A search may take what it was given on top.
+        seconds = settings.timeout + (job.max_seconds or self._engine.options.search.max_seconds)
+        return self._worker.request(job, Terms(len(job.message.data), seconds, wanted))
+
+    def drop_late(self) -> None:
+        """Tell those whose time is up while they wait."""
+        self._worker.drop_late()
 
     def stop(self, timeout: float) -> bool:
         """Have the running localization given up; return whether it ended within `timeout` seconds."""
@@ -166,7 +209,7 @@ class Attempts:
         if self._follower.state.standing().state is State.LOST:
             publishers.forget()
         try:
-            query = self._follower.for_image(job.message, job.camera, job.prior)
+            query = self._follower.for_image(job.message, job.camera, job.prior, job.inputs)
             extrinsics = publishers.extrinsics(header, job.shared)
         except ValueError as error:
             if job.shared and self.publishing:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 import time
+import traceback
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 
+from gsfeatloc_ros.common.words import in_one_line, shortened
 from gsfeatloc_ros.localize.estimate import Estimate
 from gsfeatloc_ros.localize.protection import ProtectionLevel
 from gsfeatloc_ros.node.qos import RELIABLE
@@ -25,11 +27,14 @@ LEVELS = {
     OutcomeStatus.AMBIGUOUS: WARN,
     OutcomeStatus.UNCONFIRMED: WARN,
     OutcomeStatus.REFUSED: ERROR,
+    OutcomeStatus.BUSY: WARN,
     OutcomeStatus.ERROR: ERROR,
 }
 
 # Seconds. A camera that sends 30 unusable images a second must not flood the log and /diagnostics.
 _MIN_WARNING_PERIOD = 1.0
+# Characters. Traces are long.
+_MAX_ERROR_LENGTH = 10_000
 
 
 def stamp_text(stamp: Time) -> str:
@@ -70,8 +75,8 @@ def stage_texts(estimate: Estimate) -> dict[str, str]:
 def status_message(node: Node, part: str, level: bytes, message: str, values: dict[str, str]) -> DiagnosticStatus:
     """Return the status of a part of a node."""
     name = f"{node.get_fully_qualified_name().lstrip('/')}: {part}"
-    pairs = [KeyValue(key=key, value=value) for key, value in values.items()]
-    return DiagnosticStatus(level=level, name=name, message=message, values=pairs)
+    pairs = [KeyValue(key=key, value=shortened(value)) for key, value in values.items()]
+    return DiagnosticStatus(level=level, name=name, message=shortened(message), values=pairs)
 
 
 class Reporter:
@@ -84,23 +89,36 @@ class Reporter:
 
     def warn(self, subject: str, reason: str) -> bool:
         """Log a warning; do not, and return False, when the last one on `subject` was not long enough ago."""
-        now = time.monotonic()
-        if now < self._next_warning.get(subject, 0.0):
+        if not self._is_due(subject):
             return False
-        self._next_warning[subject] = now + _MIN_WARNING_PERIOD
-        self._node.get_logger().warning(reason)
+        self._node.get_logger().warning(shortened(reason))
         return True
+
+    def fail(self, error: Exception) -> None:
+        """Log and publish an exception that nobody foresaw, when the last one was long enough ago."""
+        if self._is_due("failure"):
+            reason = in_one_line(error)
+            self.error(f"the node goes on after a failure: {reason}\n{''.join(traceback.format_exception(error))}")
+            self.diagnose("failure", ERROR, reason, {})
 
     def info(self, reason: str) -> None:
         """Log what is worth knowing."""
-        self._node.get_logger().info(reason)
+        self._node.get_logger().info(shortened(reason))
 
     def error(self, reason: str) -> None:
-        """Log an error."""
-        self._node.get_logger().error(reason)
+        """Log an error, which may hold a trace."""
+        self._node.get_logger().error(shortened(reason, _MAX_ERROR_LENGTH))
 
     def diagnose(self, part: str, level: bytes, message: str, values: dict[str, str]) -> None:
         """Publish the status of a part of the node."""
         array = DiagnosticArray(status=[status_message(self._node, part, level, message, values)])
         array.header.stamp = self._node.get_clock().now().to_msg()
         self._publisher.publish(array)
+
+    def _is_due(self, subject: str) -> bool:
+        """Return whether the last words on a subject were long enough ago, and note that there are some now."""
+        now = time.monotonic()
+        if now < self._next_warning.get(subject, 0.0):
+            return False
+        self._next_warning[subject] = now + _MIN_WARNING_PERIOD
+        return True

@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import functools
+import sys
+from collections.abc import Callable
+
+from lifecycle_msgs.msg import State
 from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import JumpThreshold, TimeJump
@@ -10,10 +15,18 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 
+from gsfeatloc_ros.common.words import in_one_line
 from gsfeatloc_ros.localize.engine import load_engine
 from gsfeatloc_ros.node.diagnostics import Reporter
+from gsfeatloc_ros.node.loading import load
 from gsfeatloc_ros.node.map_change import PATH, MapChange
-from gsfeatloc_ros.node.parameters import check_choices, declare_parameters, read_settings, without_retired
+from gsfeatloc_ros.node.parameters import (
+    check_choices,
+    declare_parameters,
+    read_settings,
+    refuse_unreadable,
+    without_retired,
+)
 from gsfeatloc_ros.node.services import Services
 from gsfeatloc_ros.node.session import Session
 from gsfeatloc_ros.node.transforms import Transforms
@@ -22,27 +35,51 @@ from gsfeatloc_ros.node.transforms import Transforms
 _MAX_STEP_BACK = Duration(seconds=1)
 # Seconds that the running localization gets to end when the node is cleaned up.
 _STOP_TIMEOUT = 3.0
+# Seconds that no localization takes; the widest search takes less than a minute.
+_MAX_BUSY = 300.0
+
+
+_Transition = Callable[["LocalizerNode", LifecycleState], TransitionCallbackReturn]
+
+
+def _logged(transition: _Transition) -> _Transition:
+    """Log the exception of a transition, of which rclpy says nothing."""
+
+    @functools.wraps(transition)
+    def run(node: LocalizerNode, state: LifecycleState) -> TransitionCallbackReturn:
+        try:
+            return transition(node, state)
+        except Exception as error:
+            node.get_logger().fatal(in_one_line(error))
+            return TransitionCallbackReturn.ERROR
+
+    return run
 
 
 class LocalizerNode(LifecycleNode):
     """A lifecycle node: configured, it has loaded the map; active, it listens, publishes and answers requests.
 
+    Args:
+        go_on: is asked again and again while a map is loaded whether to go on waiting for it.
+
     Raises:
         ValueError, rclpy.exceptions.ParameterException: a parameter cannot be used; the message says why.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, go_on: Callable[[], bool] = lambda: True) -> None:
         super().__init__("localizer")
+        self._go_on = go_on
         self._settings = declare_parameters(self)
         self._reporter = Reporter(self)
         # For good: tf2_ros's listener cannot be taken back.
         self._transforms = Transforms(self)
         self._session: Session | None = None
         self._map_change = MapChange(self, self._reporter)
-        self._requests = Services(self, lambda: self._session)
+        self._requests = Services(self, lambda: self._session, self.report_failure)
         # rclpy answers a transition that the state does not allow with an exception that ends the process.
         self._change_state = self._service_change_state.callback
         self._service_change_state.callback = self._on_change_state
+        refuse_unreadable(self)
         self.add_pre_set_parameters_callback(lambda parameters: without_retired(self, parameters))
         self.add_on_set_parameters_callback(self._check_parameters)
         self.add_post_set_parameters_callback(self._use_parameters)
@@ -55,6 +92,21 @@ class LocalizerNode(LifecycleNode):
         """Whether to configure and activate at once, without a lifecycle manager."""
         return self._settings.node.autostart
 
+    def start(self) -> bool:
+        """Configure and activate; return whether that worked, the log says why where it did not."""
+        success = TransitionCallbackReturn.SUCCESS
+        return self.trigger_configure() == success and self.trigger_activate() == success
+
+    @property
+    def finalized(self) -> bool:
+        """Whether it was shut down by a transition: there is no way back."""
+        return self._state_machine.current_state[0] == State.PRIMARY_STATE_FINALIZED
+
+    @property
+    def stuck(self) -> bool:
+        """Whether a localization has begun that does not come to an end."""
+        return self._session is not None and self._session.attempts.busy_seconds > _MAX_BUSY
+
     @property
     def session(self) -> Session | None:
         """What there is while the node is configured."""
@@ -65,29 +117,42 @@ class LocalizerNode(LifecycleNode):
         """Number of requests in progress."""
         return self._requests.unanswered
 
+    def report_failure(self, error: Exception) -> None:
+        """Log and publish that a callback failed, or that a message could not be taken; not too often."""
+        try:
+            self._reporter.fail(error)
+        except Exception:  # of memory there may be none to say so
+            sys.stderr.write("a callback failed, and the log fails as well\n")
+
     # The lifecycle.
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Load the map, compile, be ready to listen; log why where that fails."""
         settings = self._settings
         try:
-            engine = load_engine(settings.map, settings.matcher, settings.renderer, settings.localizer)
+            engine = load(
+                lambda: load_engine(settings.map, settings.matcher, settings.renderer, settings.localizer), self._go_on
+            )
             self._session = Session(self, settings, engine, self._transforms, self._reporter)
-        except (ValueError, OSError, RuntimeError) as error:
-            self.get_logger().fatal(str(error))
+        except Exception as error:  # whatever it is: rclpy says nothing of it
+            if self._go_on():
+                self.get_logger().fatal(in_one_line(error))
             return TransitionCallbackReturn.FAILURE
         return TransitionCallbackReturn.SUCCESS
 
+    @_logged
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Listen to topics and publish."""
         self._configured_session().activate()
         return TransitionCallbackReturn.SUCCESS
 
+    @_logged
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Neither listen nor publish."""
         self._configured_session().deactivate()
         return TransitionCallbackReturn.SUCCESS
 
+    @_logged
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Let go of the map."""
         session = self._configured_session()
@@ -96,12 +161,23 @@ class LocalizerNode(LifecycleNode):
         self._session = None
         return TransitionCallbackReturn.SUCCESS
 
+    @_logged
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Do the same, from whatever state."""
         if self._session is None:
             return TransitionCallbackReturn.SUCCESS
         self._session.deactivate()
         return self.on_cleanup(state)
+
+    @_logged
+    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Let go of what is left after a transition that failed: it can be configured again."""
+        session, self._session = self._session, None
+        if session is not None:
+            session.deactivate()
+            session.stop(_STOP_TIMEOUT)
+            session.close()
+        return TransitionCallbackReturn.SUCCESS
 
     def _configured_session(self) -> Session:
         assert self._session is not None  # the lifecycle sees to it

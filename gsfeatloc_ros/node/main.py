@@ -1,79 +1,95 @@
-"""The executable `localizer`: start, spin until a signal, leave in order."""
+"""The executable `localizer`: start, spin until it is to end, leave in order."""
 
 from __future__ import annotations
 
-import faulthandler
-import os
-import signal
 import sys
 import threading
 import time
-from collections.abc import Callable
-from types import FrameType
+from typing import TYPE_CHECKING
 
 from gsfeatloc_ros.common.openmp import wait_passively
+from gsfeatloc_ros.common.words import in_one_line
+from gsfeatloc_ros.node.environment import check_environment
+from gsfeatloc_ros.node.stop import Stop, leave
+from gsfeatloc_ros.node.systemd import Systemd
 
-# Seconds that the running localization gets to end after a signal, and requests in progress to be answered.
+if TYPE_CHECKING:
+    from gsfeatloc_ros.node.executor import GuardedExecutor
+    from gsfeatloc_ros.node.localizer_node import LocalizerNode
+
+# Seconds that the running localization gets to end when the process is to, and requests in progress to be answered.
 _STOP_TIMEOUT = 3.0
-_ANSWER_TIMEOUT = 0.5
-# Seconds after which a process that still has not left is ended.
-_LEAVE_TIMEOUT = 10.0
-# Seconds between two looks for a signal while spinning.
-_SIGNAL_PERIOD = 0.1
+_ANSWER_TIMEOUT = 1.0
+# Seconds between two looks whether to end while spinning.
+_PERIOD = 0.1
 
 
 def main(args: list[str] | None = None) -> int:
-    """Run the node until SIGINT or SIGTERM; return the exit status."""
-    # Before the imports below: they load OpenMP, and take seconds, in which a signal must not end in a traceback.
+    """Run the node until SIGINT, SIGTERM or a transition to `finalized`; return the exit status.
+
+    It is 0 if the node was asked to end, and 1 if it could not start or go on: then the last line says why.
+    """
+    # Before the imports below: they load OpenMP.
     wait_passively()
-    _on_signal(lambda number, frame: sys.exit(0))
-    import rclpy
-    from rclpy.exceptions import ParameterException
-    from rclpy.executors import SingleThreadedExecutor
-    from rclpy.lifecycle import TransitionCallbackReturn
-    from rclpy.signals import SignalHandlerOptions
-
-    from gsfeatloc_ros.node.localizer_node import LocalizerNode
-
-    # rclpy's own handlers shut the context down at once; the running localization and requests are to end first.
+    stop, systemd = Stop(), Systemd()
     try:
-        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
-        node = LocalizerNode()
-    except (ValueError, ParameterException) as error:
-        rclpy.logging.get_logger("localizer").fatal(str(error))
-        return 1
-    if node.autostart:
-        if node.trigger_configure() != TransitionCallbackReturn.SUCCESS:
-            return 1  # the reason is in the log
-        node.trigger_activate()
-    stopping = threading.Event()
-    _on_signal(lambda number, frame: stopping.set())
-    executor = SingleThreadedExecutor()
-    executor.add_node(node)
-    while not stopping.is_set():
-        executor.spin_once(timeout_sec=_SIGNAL_PERIOD)
+        check_environment()
+        # What these imports load takes seconds, and may not be there.
+        import rclpy
 
-    # Should anything below hang, in the middleware say, the process ends all the same, and the log shows where it was.
-    faulthandler.dump_traceback_later(_LEAVE_TIMEOUT, exit=True)
-    session = node.session
-    if session and not session.stop(_STOP_TIMEOUT):
-        node.get_logger().warning("the running localization did not end in time")
-        # The thread is in native code that the interpreter's own exit would pull away under it.
-        sys.stderr.flush()
-        os._exit(0)
-    if node.unanswered_requests:
-        # A service cannot wait for acknowledgements: the answers get this long to be sent and to arrive.
-        deadline = time.monotonic() + _ANSWER_TIMEOUT
-        while time.monotonic() < deadline:
-            executor.spin_once(timeout_sec=_SIGNAL_PERIOD)
-    node.destroy_node()
-    rclpy.shutdown()
+        from gsfeatloc_ros.node.executor import GuardedExecutor, HopelessError
+        from gsfeatloc_ros.node.localizer_node import LocalizerNode
+
+        # rclpy's own handlers shut the context down at once; the running localization and requests are to end first.
+        rclpy.init(args=args, signal_handler_options=rclpy.signals.SignalHandlerOptions.NO)
+        stop.in_order = True
+
+        def go_on() -> bool:
+            systemd.beat()
+            return not stop
+
+        node = LocalizerNode(go_on)
+    except Exception as error:
+        # There is no node whose log could say it.
+        print(f"[FATAL] [{time.time():.9f}] [localizer]: {in_one_line(error)}", file=sys.stderr)
+        return 1
+    if node.autostart and not node.start():
+        # The reason is in the log. What was given up may still be at work.
+        leave(0 if stop else 1)
+    systemd.ready()
+    executor = GuardedExecutor(node.report_failure)
+    executor.add_node(node)
+    try:
+        while not stop:
+            executor.spin_once(_PERIOD)
+            if not node.stuck:
+                systemd.beat()
+            if node.finalized:
+                stop.ask()
+    except HopelessError as error:
+        node.get_logger().fatal(in_one_line(error))
+        leave(1)
+    systemd.stopping()
+    _end(node, executor)
     return 0
 
 
-def _on_signal(handler: Callable[[int, FrameType | None], None]) -> None:
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, handler)
+def _end(node: LocalizerNode, executor: GuardedExecutor) -> None:
+    """Give up what runs, answer who waits, and leave the graph."""
+    import rclpy
+
+    session = node.session
+    if session and not session.stop(_STOP_TIMEOUT):
+        node.get_logger().warning("the running localization did not end in time")
+        leave(0)
+    # A service cannot wait for acknowledgements: the answers get this long to be sent and to arrive.
+    deadline = time.monotonic() + (_ANSWER_TIMEOUT if node.unanswered_requests or node.finalized else 0.0)
+    while time.monotonic() < deadline:
+        executor.spin_once(_PERIOD)
+    node.destroy_node()
+    rclpy.shutdown()
+    if any(thread.name == "loader" for thread in threading.enumerate()):
+        leave(0)
 
 
 if __name__ == "__main__":

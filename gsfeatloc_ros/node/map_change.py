@@ -8,8 +8,10 @@ import threading
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
+from gsfeatloc_ros.common.words import in_one_line
 from gsfeatloc_ros.localize.engine import Engine, load_renderer
 from gsfeatloc_ros.node.diagnostics import ERROR, OK, Reporter
+from gsfeatloc_ros.node.loading import load
 from gsfeatloc_ros.node.session import Session
 from gsfeatloc_ros.ros_io.settings import Settings
 
@@ -47,13 +49,14 @@ class MapChange:
         if self._going_back:
             return
         self._loading = settings.map.path
-        threading.Thread(target=self._load, args=(session, settings), name="loader", daemon=True).start()
+        threading.Thread(target=self._load, args=(session, settings), name="map change", daemon=True).start()
 
     def _load(self, session: Session, settings: Settings) -> None:
-        """Load the map in a thread of its own, and have the executor's thread use it or go back to the old one."""
+        """Load the map beside the executor's thread, and have that use it or go back to the old one."""
         loaded: Engine | Exception
         try:
-            loaded = session.engine.with_map(settings.map.path, load_renderer(settings.map, settings.renderer))
+            renderer = load(lambda: load_renderer(settings.map, settings.renderer), lambda: not session.closed)
+            loaded = session.engine.with_map(settings.map.path, renderer)
         except Exception as error:  # whatever it is, the old map serves on
             loaded = error
         executor = self._node.executor
@@ -71,8 +74,8 @@ class MapChange:
             self._reporter.diagnose("map", OK, reason, {"map": loaded.map_path})
             return
         old = session.engine.map_path
-        reason = f"the map is still {old}: {loaded}"
-        self._node.get_logger().error(reason)
+        reason = f"the map is still {old}: {in_one_line(loaded)}"
+        self._reporter.error(reason)
         self._reporter.diagnose("map", ERROR, reason, {"map": old})
         self._going_back = True
         self._node.set_parameters([Parameter(PATH, value=old)])

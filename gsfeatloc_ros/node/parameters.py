@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
+from rcl_interfaces.msg import Parameter as ParameterMessage
+from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
 from gsfeatloc_ros.common.parameter import Parameter
+from gsfeatloc_ros.common.words import in_one_line, shortened
 from gsfeatloc_ros.ros_io.settings import PARAMETERS, Settings
 
 # Names that are accepted for one more release, though they have no effect, and what to set instead.
@@ -81,6 +84,35 @@ def without_retired(node: Node, parameters: Sequence[RosParameter]) -> list[RosP
             kept.append(parameter)
     # rclpy says that setting no parameter fails: what was to be set instead stays as it is.
     return kept or [node.get_parameter(_RETIRED[parameter.name]) for parameter in parameters[:1]]
+
+
+def refuse_unreadable(node: Node) -> None:
+    """Have a node refuse values that rclpy cannot read, with the reason, where rclpy answers nothing.
+
+    Such are values of a type that there is not, and names that no parameter can have.
+    """
+
+    def set_each(request: SetParameters.Request, response: SetParameters.Response) -> SetParameters.Response:
+        response.results = [_set_atomically(node, [parameter]) for parameter in request.parameters]
+        return response
+
+    def set_all(
+        request: SetParametersAtomically.Request, response: SetParametersAtomically.Response
+    ) -> SetParametersAtomically.Response:
+        response.result = _set_atomically(node, request.parameters)
+        return response
+
+    callbacks = {SetParameters: set_each, SetParametersAtomically: set_all}
+    for service in node.services:
+        service.callback = callbacks.get(service.srv_type, service.callback)
+
+
+def _set_atomically(node: Node, messages: Sequence[ParameterMessage]) -> SetParametersResult:
+    try:
+        return node.set_parameters_atomically([RosParameter.from_parameter_msg(message) for message in messages])
+    except Exception as error:
+        names = ", ".join(shortened(repr(message.name), 100) for message in messages)
+        return SetParametersResult(successful=False, reason=shortened(f"{names} cannot be set: {in_one_line(error)}"))
 
 
 def _warn_of_retired(node: Node, name: str) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -85,7 +86,11 @@ class Reception:
         self._schedule.settings = settings.node
 
     def newest(self) -> Job:
-        """Return the newest image as a job; raise ValueError, which names all that is missing, where it cannot be."""
+        """Return the newest image as a job, with the camera_info and the prior of now.
+
+        Raises:
+            ValueError: it cannot be localized; all that is missing is named.
+        """
         problems, job, silence = self._inputs.missing, self._job, self._report.health.silence
         if isinstance(job, str):
             raise ValueError("; ".join([job, *problems]))
@@ -93,7 +98,7 @@ class Reception:
             problems.insert(0, f"the newest image came {silence:.1f} s ago: is the camera running?")
         if problems:
             raise ValueError("; ".join(problems))
-        return job
+        return replace(job, inputs=self._inputs.newest())
 
     def _subscribe(self, topic: Topic, callback: Callable[[Any], None]) -> None:
         refuse = partial(self._report.refuse, f"qos of {topic.name}")

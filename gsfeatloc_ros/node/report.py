@@ -47,11 +47,16 @@ class Health:
         self._now = now
         self._attempts: deque[_Attempt] = deque(maxlen=_MAX_COUNTED)
         self._images: deque[float] = deque(maxlen=_MAX_COUNTED)
+        self._unserved: deque[float] = deque(maxlen=_MAX_COUNTED)
         self._stage_texts: dict[str, str] = {}
 
     def count_image(self) -> None:
         """Count an image that came."""
         self._images.append(self._now())
+
+    def count_unserved(self) -> None:
+        """Count a request that was told that the node is busy."""
+        self._unserved.append(self._now())
 
     def count_attempt(self, outcome: Outcome) -> None:
         """Count what came of an image."""
@@ -77,6 +82,9 @@ class Health:
             return ERROR, no_image
         if images_wanted and self.silence > image_timeout:
             return ERROR, f"no image for {self.silence:.0f} s: is the camera running?"
+        unserved = sum(moment > self._now() - _WINDOW for moment in self._unserved.copy())
+        if unserved:
+            return WARN, f"busy: {unserved} requests of the last {_WINDOW:g} s were not served: ask less often"
         if not recent:
             return OK, "nothing to localize"
         last, answers = recent[-1], _answers(recent)
@@ -139,6 +147,11 @@ class Report:
     def count_answer(self) -> None:
         """Count an answer that is published."""
         self.answers += 1
+
+    def count_unserved(self, service: str, reason: str) -> None:
+        """Count and log a request that was told that the node is busy."""
+        self.health.count_unserved()
+        self._reporter.warn("busy", f"{service}: {reason}")
 
     def publish_ready(self, reason: str) -> None:
         """Publish that the session has begun."""

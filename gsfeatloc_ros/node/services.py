@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from concurrent.futures import Future
+from concurrent.futures import CancelledError, Future
 from typing import Any
 
 import rclpy.task
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
+from rclpy.qos import QoSProfile
 from std_srvs.srv import Empty, Trigger
 
 from gsfeatloc_ros.common.stage_clock import Interrupted
-from gsfeatloc_ros.node.attempts import Attempts, Job, JobResult
+from gsfeatloc_ros.node.attempts import Job, JobResult
 from gsfeatloc_ros.node.interfaces import LocalizeImage
+from gsfeatloc_ros.node.qos import IMAGE_REQUESTS, REQUESTS
 from gsfeatloc_ros.node.session import Session
+from gsfeatloc_ros.node.worker import UnservedError
 from gsfeatloc_ros.ros_io.calibration import decode_camera
 from gsfeatloc_ros.ros_io.outcome import Outcome, OutcomeStatus
 from gsfeatloc_ros.ros_io.prior import PriorSource, decode_prior
@@ -33,34 +36,33 @@ class Services:
     Args:
         node: whose services they are.
         session: returns the one that there is now, if any.
+        on_failure: is told each exception that nobody foresaw.
 
     Attributes:
         unanswered: number of requests in progress.
     """
 
-    def __init__(self, node: Node, session: Callable[[], Session | None]) -> None:
-        self._node, self._session = node, session
+    def __init__(
+        self, node: Node, session: Callable[[], Session | None], on_failure: Callable[[Exception], None]
+    ) -> None:
+        self._node, self._session, self._on_failure = node, session, on_failure
         self.unanswered = 0
         # Reentrant: a request that waits for the worker must not hold up the next one.
-        group = ReentrantCallbackGroup()
-        node.create_service(Trigger, "~/relocalize", self._on_relocalize, callback_group=group)
+        self._group = ReentrantCallbackGroup()
+        self._create(Trigger, "~/relocalize", self._on_relocalize, REQUESTS)
         # Of this name, in the node's namespace, as AMCL has it: Nav2's recovery calls it.
-        node.create_service(Empty, "reinitialize_global_localization", self._on_reinitialize)
+        self._create(Empty, "reinitialize_global_localization", self._on_reinitialize, REQUESTS)
         if LocalizeImage is None:
             node.get_logger().info(
                 "the service ~/localize_image and the topic protection_level are off: build the package "
                 "gsfeatloc_interfaces (interfaces/), source it"
             )
         else:
-            node.create_service(LocalizeImage, "~/localize_image", self._on_localize_image, callback_group=group)
+            self._create(LocalizeImage, "~/localize_image", self._on_localize_image, IMAGE_REQUESTS)
 
     async def _on_relocalize(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Localize the newest image."""
-        try:
-            session = self._active_session()
-            result = await self._result(session.attempts, session.reception.newest())
-        except ValueError as error:
-            result = JobResult(Outcome.refused(error))
+        result = await self._result("~/relocalize", lambda session: session.reception.newest())
         response.success, response.message = result.answer is not None, result.outcome.reason
         return response
 
@@ -75,17 +77,14 @@ class Services:
 
     async def _on_localize_image(self, request: Any, response: Any) -> Any:
         """Localize the image of a LocalizeImage."""
-        try:
-            session = self._active_session()
-            result = await self._result(session.attempts, _requested_job(request, session))
-        except ValueError as error:
-            result = JobResult(Outcome.refused(error))
+        result = await self._result("~/localize_image", lambda session: _requested_job(request, session))
         outcome, answer = result.outcome, result.answer
         response.status = {
             OutcomeStatus.LOCALIZED: response.LOCALIZED,
             OutcomeStatus.REJECTED: response.REJECTED,
             OutcomeStatus.FAILED: response.FAILED,
             OutcomeStatus.REFUSED: response.REFUSED,
+            OutcomeStatus.BUSY: response.BUSY,
             OutcomeStatus.ERROR: response.ERROR,
             OutcomeStatus.AMBIGUOUS: response.AMBIGUOUS,
         }[outcome.status]
@@ -110,22 +109,42 @@ class Services:
             raise ValueError(_INACTIVE)
         return session
 
-    async def _result(self, attempts: Attempts, job: Job) -> JobResult:
-        """Have a job done before all that comes by itself."""
+    def _create(self, service_type: type, name: str, callback: Callable[[Any, Any], Any], qos: QoSProfile) -> None:
+        self._node.create_service(service_type, name, callback, qos_profile=qos, callback_group=self._group)
+
+    async def _result(self, service: str, make: Callable[[Session], Job]) -> JobResult:
+        """Return what comes of the job that a request to a service makes; whatever happens, there is an answer."""
+        try:
+            session = self._active_session()
+            done = session.attempts.request(make(session), session.settings.requests, lambda: self._has_client(service))
+            return await self._await(done)
+        except ValueError as error:
+            return JobResult(Outcome.refused(error))
+        except UnservedError as error:
+            outcome = Outcome.busy(f"{error}: ask again later, or less often (parameters requests.*)")
+            session.report.count_unserved(service, outcome.reason)
+            return JobResult(outcome)
+        except (CancelledError, Interrupted):
+            return JobResult(Outcome.refused("the node is stopping"))
+        except Exception as error:
+            self._on_failure(error)
+            return JobResult(Outcome.error(error))
+
+    async def _await(self, done: Future[JobResult]) -> JobResult:
+        """Wait for the worker, without holding up the executor."""
         answer, executor = rclpy.task.Future(), self._node.executor
         assert executor is not None  # this is run by it
-
-        def pass_on(done: Future[JobResult]) -> None:
-            stopped = done.cancelled() or isinstance(done.exception(), Interrupted)
-            result = JobResult(Outcome.refused("the node is stopping")) if stopped else done.result()
-            # Setting the answer in a task wakes the executor, which then resumes this coroutine.
-            executor.create_task(answer.set_result, result)
-
         self.unanswered += 1
-        attempts.request(job).add_done_callback(pass_on)
-        result = await answer
+        # Setting the answer in a task wakes the executor, which then resumes this coroutine.
+        done.add_done_callback(lambda done: executor.create_task(answer.set_result, done))
+        finished = await answer
         self.unanswered -= 1
+        result: JobResult = finished.result()
         return result
+
+    def _has_client(self, service: str) -> bool:
+        """Return whether there is any client of a service; rclpy does not tell whose a request is."""
+        return self._node.count_clients(self._node.resolve_service_name(service)) > 0
 
 
 def _requested_job(request: Any, session: Session) -> Job:
@@ -138,4 +157,6 @@ def _requested_job(request: Any, session: Session) -> Job:
         prior = decode_prior(request.prior, PriorSource.REQUEST, settings.prior_policy())
     if not (math.isfinite(request.max_seconds) and request.max_seconds >= 0):
         raise ValueError(f"max_seconds is {request.max_seconds}: 0 for the parameter's, or more")
-    return Job(request.image, camera, prior, shared=False, kept=not request.forget, max_seconds=request.max_seconds)
+    inputs = session.inputs.newest()
+    kept = not request.forget
+    return Job(request.image, camera, prior, inputs, shared=False, kept=kept, max_seconds=request.max_seconds)

@@ -23,8 +23,10 @@ from gsfeatloc_ros.ros_io.pictures import PictureReader
 from gsfeatloc_ros.ros_io.settings import CONTINUOUS, ON_REQUEST, Settings
 from gsfeatloc_ros.ros_io.state import LocalizationState, State
 
-# Seconds between two reports on the node's health, as of diagnostic_updater, and between two saves of the last pose.
+# Seconds between two reports on the node's health, as of diagnostic_updater, between two looks for requests that have
+# waited too long, and between two saves of the last pose.
 _HEALTH_PERIOD = 1.0
+_LATE_PERIOD = 0.2
 _SAVE_PERIOD = 5.0
 
 
@@ -45,6 +47,8 @@ class Session:
     Attributes:
         reception: of the messages.
         attempts: to localize.
+        inputs: what images are localized with.
+        report: of how it goes.
         settings: as they are now.
         active: whether it listens and publishes.
         closed: whether it has ended.
@@ -62,7 +66,7 @@ class Session:
         state = LocalizationState(settings.recovery.state, lambda: node.get_clock().now().nanoseconds)
         self._publishers = Publishers(node, settings, transforms, lambda: state.standing().state is State.LOST)
         self._standing = StandingPublisher(node, state, reporter)
-        self._report = Report(reporter, lambda: self.attempts.dropped)
+        self.report = Report(reporter, lambda: self.attempts.dropped)
         inputs = Inputs(
             settings.prior_policy(),
             transforms.lookup,
@@ -70,18 +74,19 @@ class Session:
             f"no camera_info yet: publish sensor_msgs/CameraInfo on {node.resolve_topic_name('camera_info')}",
             PictureReader(settings.image.bits, reporter.info),
         )
-        self._inputs, self._follower = inputs, Follower(inputs, state, settings.node.track)
+        self.inputs, self._follower = inputs, Follower(inputs, state, settings.node.track)
         self._pose_file = PoseFile(settings.state.path, settings.map, reporter)
         self._use_saved_pose()
-        outputs = Outputs(self._publishers, self._standing, self._pose_file, self._report)
+        outputs = Outputs(self._publishers, self._standing, self._pose_file, self.report)
         self.attempts = Attempts(engine, self._follower, outputs)
-        self.reception = Reception(node, settings, inputs, self._report, self.attempts.offer)
+        self.reception = Reception(node, settings, inputs, self.report, self.attempts.offer)
         self._index_build = IndexBuild(self.attempts, reporter)
         self._index_build.start(settings)
         # On a clock of its own: that of a simulation may stand still.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._timers = [
             node.create_timer(_HEALTH_PERIOD, self._report_health, clock=steady),
+            node.create_timer(_LATE_PERIOD, self.attempts.drop_late, clock=steady),
             node.create_timer(_SAVE_PERIOD, self._pose_file.save, clock=steady),
         ]
         self.use_settings(settings)
@@ -102,7 +107,7 @@ class Session:
             f"{engine.renderer.device}, {settings.node.mode}, topics {' '.join(self.reception.topics)} -> "
             f"{self._publishers.topic}"
         )
-        self._report.publish_ready(f"ready: {self.reception.no_image}")
+        self.report.publish_ready(f"ready: {self.reception.no_image}")
         self._standing.publish()
 
     def deactivate(self) -> None:
@@ -149,8 +154,8 @@ class Session:
     def use_settings(self, settings: Settings) -> None:
         """Go on with other settings, but for those that are read when the node is configured."""
         self.settings = settings
-        self._inputs.policy = settings.prior_policy()
-        self._inputs.line_delay = settings.image.line_delay
+        self.inputs.policy = settings.prior_policy()
+        self.inputs.line_delay = settings.image.line_delay
         self._follower.state.options = settings.recovery.state
         self._follower.images_come = settings.node.mode != ON_REQUEST
         self.reception.use_settings(settings)
@@ -159,7 +164,7 @@ class Session:
     def forget_after(self, stamp: int) -> None:
         """Forget what is stamped later than `stamp` (nanoseconds): time went back."""
         self._transforms.forget()
-        self._inputs.forget_after(stamp)
+        self.inputs.forget_after(stamp)
         self._follower.lose("time went back", with_priors=False)
         self._publishers.forget()
 
@@ -176,7 +181,7 @@ class Session:
         pose = self._pose_file.load() if self.settings.node.track else None
         if pose is not None:
             sigma = self.settings.recovery.state.lost_distance
-            self._inputs.start_from(self.settings.prior_policy().saved(pose, sigma))
+            self.inputs.start_from(self.settings.prior_policy().saved(pose, sigma))
 
     def _report_health(self) -> None:
         mode, last = self.settings.node.mode, self._publishers.last_stamp
@@ -185,7 +190,7 @@ class Session:
             self._standing.publish()
         level, reason = OK, "inactive"
         if self.active:
-            level, reason = self._report.health.assess(
+            level, reason = self.report.health.assess(
                 self.settings.image.timeout, mode != ON_REQUEST, self.reception.no_image
             )
         age = "nan" if last is None else f"{1e-9 * (self._node.get_clock().now().nanoseconds - last):.1f}"
@@ -197,5 +202,7 @@ class Session:
             "map_notes": "; ".join(renderer.reading.notes),
             "device": renderer.device,
             "answer_age": age,
+            "requests_waiting": str(self.attempts.waiting),
+            "requests_busy": str(self.attempts.unserved),
         }
-        self._report.publish_health(level, reason, about)
+        self.report.publish_health(level, reason, about)

@@ -11,7 +11,7 @@ from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.localize.estimate import Estimate
 from gsfeatloc_ros.localize.options import MAX_SEED, LocalizerOptions
 from gsfeatloc_ros.ros_io.decode import frame_name, nanoseconds
-from gsfeatloc_ros.ros_io.inputs import Inputs, LocalizerInput
+from gsfeatloc_ros.ros_io.inputs import Inputs, LocalizerInput, NewestInputs
 from gsfeatloc_ros.ros_io.message_types import AnyImage, Header
 from gsfeatloc_ros.ros_io.prior import Prior, PriorSource
 from gsfeatloc_ros.ros_io.state import Attempt, Decision, Judgement, LocalizationState, is_unattested
@@ -40,12 +40,18 @@ class Follower:
         # Views of the index that were looked at in vain, and the stamp of the image from whose place they were.
         self._looked_at, self._looked_from = 0, 0
 
-    def for_image(self, message: AnyImage, camera: Camera | None = None, prior: Prior | None = None) -> LocalizerInput:
+    def for_image(
+        self,
+        message: AnyImage,
+        camera: Camera | None = None,
+        prior: Prior | None = None,
+        inputs: NewestInputs | None = None,
+    ) -> LocalizerInput:
         """Return what to localize an image with; arguments and errors as of `Inputs.for_image`."""
-        query = self._inputs.for_image(message, camera, prior)
+        query = self._inputs.for_image(message, camera, prior, inputs)
         if self.state.outgrown(query.source, query.prior_covariance):
             self._inputs.forget_answer()
-            query = self._inputs.for_image(message, camera, prior)
+            query = self._inputs.for_image(message, camera, prior, inputs and inputs.without_prior())
         return query
 
     def options(self, options: LocalizerOptions, header: Header) -> LocalizerOptions:

@@ -86,6 +86,24 @@ class _Newest(Generic[T]):
 _NOTHING: _Newest[Prior] = _Newest()
 
 
+@dataclass(frozen=True, eq=False)
+class NewestInputs:
+    """The newest camera_info and prior of a moment, or why they cannot be used.
+
+    Attributes:
+        camera, prior: see there.
+        forgotten: how often something was forgotten up to then: what was forgotten since does not count.
+    """
+
+    camera: _Newest[Camera]
+    prior: _Newest[Prior]
+    forgotten: int = 0
+
+    def without_prior(self) -> NewestInputs:
+        """Return the same camera, and nothing of where it is."""
+        return replace(self, prior=_NOTHING)
+
+
 class Inputs:
     """The newest camera_info, prior and odometry, and what follows from them for an image.
 
@@ -121,6 +139,7 @@ class Inputs:
         self._camera: _Newest[Camera] = _Newest(problem=no_camera)
         self._prior: _Newest[Prior] = _NOTHING
         self._prior_lock = Lock()
+        self._forgotten = 0
         self._odometry = self._no_odometry()
         # Of the odometry itself, and of the body whose poses it gives.
         self._odometry_frames = ("", "")
@@ -129,6 +148,10 @@ class Inputs:
     def missing(self) -> list[str]:
         """Why no image can be localized now; empty if one can."""
         return [newest.problem for newest in (self._camera, self._prior) if newest.problem]
+
+    def newest(self) -> NewestInputs:
+        """Return what an image of this moment is localized with, whatever comes later."""
+        return NewestInputs(self._camera, self._prior, self._forgotten)
 
     def take(self, topic: InputTopic, message: Any) -> None:
         """Take the newest message of a topic; one that cannot be used takes the place of an older good one.
@@ -173,6 +196,7 @@ class Inputs:
 
     def forget_after(self, stamp: int) -> None:
         """Forget what is stamped later than `stamp` (nanoseconds): time went back."""
+        self._forgotten += 1
         self._odometry.forget_after(stamp)
         with self._prior_lock:
             if self._prior.value and self._prior.value.stamp > stamp:
@@ -180,12 +204,14 @@ class Inputs:
 
     def forget_answer(self) -> None:
         """Do not go on from the last answer: it is of another map, or worth nothing any more."""
+        self._forgotten += 1
         with self._prior_lock:
             if self._prior.value and self._prior.value.source.own:
                 self._prior = _NOTHING
 
     def forget_prior(self) -> None:
         """Forget all that is known of where the robot is."""
+        self._forgotten += 1
         self._set_prior(_NOTHING)
 
     def start_from(self, saved: Prior) -> None:
@@ -217,19 +243,32 @@ class Inputs:
             else position_sigma(self._grown(prior.covariance, self.policy.growth.by_odometry(travelled)))
         )
 
-    def for_image(self, message: AnyImage, camera: Camera | None = None, prior: Prior | None = None) -> LocalizerInput:
+    def for_image(
+        self,
+        message: AnyImage,
+        camera: Camera | None = None,
+        prior: Prior | None = None,
+        inputs: NewestInputs | None = None,
+    ) -> LocalizerInput:
         """Return what to localize an image with.
 
         Args:
             message: the image.
             camera: of the image; None for that of the newest camera_info.
             prior: where it was taken; None for the newest, if there is one.
+            inputs: the newest camera_info and prior; None for those of now.
 
         Raises:
             PictureError: the image cannot be decoded, or is of another size than its camera's.
             ValueError: something is missing, of the future, or in a frame from which no way is known.
         """
-        camera, newest = camera or self._camera.get(), self._prior
+        inputs = inputs or self.newest()
+        camera = camera or inputs.camera.get()
+        newest = inputs.prior
+        if inputs.forgotten != self._forgotten and (
+            self._prior is _NOTHING or (newest.value and newest.value.source.own)
+        ):
+            newest = _NOTHING
         if prior is None and newest.problem:
             raise ValueError(newest.problem)
         prior = prior or newest.value or (self.policy.plane() if self.policy.planar else None)

@@ -14,13 +14,15 @@ from gsfeatloc_ros.ros_io.growth import Travelled
 _MAX_DISTANCE = 200_000_000
 # Nanoseconds. Stamps that go back farther than this are those of another run (a looped bag, a simulation started anew).
 _MAX_DISORDER = 1_000_000_000
+# Poses. A minute of odometry at 200 Hz; stamps may say that much less time has passed than has.
+_MAX_KEPT = 20_000
 
 
 class OdometryBuffer:
     """The newest poses of a body in its odometry frame; may be filled and read by different threads.
 
     Args:
-        seconds: how far back they are kept.
+        seconds: how far back they are kept, if that are no more than 20,000.
     """
 
     def __init__(self, seconds: float) -> None:
@@ -48,8 +50,8 @@ class OdometryBuffer:
             self._stamps.append(stamp)
             self._poses.append(pose)
             # Seldom, for it moves all that stays.
-            if self._stamps[0] < stamp - 2 * self._kept:
-                first = bisect_left(self._stamps, stamp - self._kept)
+            if self._stamps[0] < stamp - 2 * self._kept or len(self._stamps) > 2 * _MAX_KEPT:
+                first = max(bisect_left(self._stamps, stamp - self._kept), len(self._stamps) - _MAX_KEPT)
                 del self._stamps[:first], self._poses[:first], self._way[:first]
 
     def forget_after(self, stamp: int) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 
+from gsfeatloc_ros.common.words import shortened
 from gsfeatloc_ros.localize.estimate import Estimate
 from gsfeatloc_ros.ros_io.state import Decision, Judgement
 
@@ -18,6 +19,7 @@ class OutcomeStatus(Enum):
     AMBIGUOUS = "ambiguous"
     UNCONFIRMED = "unconfirmed"
     REFUSED = "refused"
+    BUSY = "busy"
     ERROR = "error"
 
 
@@ -27,7 +29,8 @@ class Outcome:
 
     Attributes:
         status: UNCONFIRMED: a pose was found that another image has to confirm. REFUSED: the image could not be tried.
-            ERROR: a bug met on it, or no memory. Otherwise the estimate's.
+            BUSY: it was asked for when too many others waited, or could not be served in time. ERROR: a bug met on it,
+            or no memory. Otherwise the estimate's.
         reason: one sentence.
         estimate: None if the image could not be tried.
     """
@@ -46,12 +49,17 @@ class Outcome:
     @staticmethod
     def refused(reason: object) -> Outcome:
         """Return the outcome of an image that could not be tried: why, in words or as an exception that has them."""
-        return Outcome(OutcomeStatus.REFUSED, str(reason))
+        return Outcome(OutcomeStatus.REFUSED, shortened(str(reason)))
+
+    @staticmethod
+    def busy(reason: str) -> Outcome:
+        """Return the outcome of a request that is not served; it starts with the word for those who read only that."""
+        return Outcome(OutcomeStatus.BUSY, f"busy: {reason}")
 
     @staticmethod
     def error(exception: Exception) -> Outcome:
         """Return the outcome of an image on which an exception was met that nobody foresaw."""
-        return Outcome(OutcomeStatus.ERROR, f"{type(exception).__name__}: {exception}")
+        return Outcome(OutcomeStatus.ERROR, shortened(f"{type(exception).__name__}: {exception}"))
 
     @property
     def localized(self) -> bool:

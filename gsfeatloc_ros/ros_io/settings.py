@@ -110,6 +110,22 @@ class ImageSettings:
 
 
 @dataclass(frozen=True)
+class RequestSettings:
+    """How many requests are taken, and for how long each may wait."""
+
+    max_waiting: int = parameter(8, "Most requests that wait; one more is told `busy` at once.", (1, 10_000), live=True)
+    max_megabytes: float = parameter(
+        32.0, "Most megabytes of images in the requests that wait, if more than one does.", (1.0, 100_000.0), live=True
+    )
+    timeout: float = parameter(
+        10.0,
+        "Seconds, beside those of the search, in which a request is answered; it is told `busy` where it cannot be.",
+        (0.1, 3600.0),
+        live=True,
+    )
+
+
+@dataclass(frozen=True)
 class RecoverySettings:
     """How a robot is followed between answers, and found again."""
 
@@ -141,6 +157,7 @@ class Settings:
     matcher: MatcherSettings = field(default_factory=MatcherSettings)
     renderer: RendererSettings = field(default_factory=RendererSettings)
     localizer: LocalizerOptions = field(default_factory=LocalizerOptions)
+    requests: RequestSettings = field(default_factory=RequestSettings)
     recovery: RecoverySettings = field(default_factory=RecoverySettings)
     state: StateSettings = field(default_factory=StateSettings)
     index: IndexOptions = field(default_factory=IndexOptions)
@@ -155,6 +172,7 @@ class Settings:
             matcher=settings_from(MatcherSettings, values, "matcher."),
             renderer=settings_from(RendererSettings, values, "renderer."),
             localizer=settings_from(LocalizerOptions, values, "localizer."),
+            requests=settings_from(RequestSettings, values, "requests."),
             recovery=settings_from(RecoverySettings, values, "search."),
             state=settings_from(StateSettings, values, "state."),
             index=settings_from(IndexOptions, values, "index."),
@@ -182,6 +200,7 @@ _GROUPS = {
     "matcher.": MatcherSettings,
     "renderer.": RendererSettings,
     "localizer.": LocalizerOptions,
+    "requests.": RequestSettings,
     "search.": RecoverySettings,
     "state.": StateSettings,
     "index.": IndexOptions,

@@ -49,6 +49,7 @@ _GROUP_HEADS = {
     "matcher": "## matcher\n\nWhich features: [matchers.md](matchers.md).",
     "renderer": "## renderer\n\nWhat draws the map, and how: [renderer.md](renderer.md), [gpu.md](gpu.md).",
     "localizer": "## localizer\n\nHow an image is localized, and what must speak for an answer: [trust.md](trust.md).",
+    "requests": "## requests\n\nHow many requests are taken: [Services](topics-and-services.md#services).",
     "search": "## search\n\nHow a robot is followed and found again: [State](topics-and-services.md#state).",
     "state": "## state\n\nWhat is kept for the next start.",
     "index": "## index\n\nThe view index.",

@@ -4,6 +4,11 @@ A process of its own publishes photos of the simulated room with real-time stamp
 are off as a robot's odometry is. Meanwhile the services are called every few seconds. Exits with 1 if a target fails.
 
     python -m gsfeatloc_ros.tools.soak --seconds 600 --size 1920x1080 --rate 10 --folder /tmp/soak --json soak.json
+
+With --flood many more requests come on top, from a process of its own, at one time of the stream; it may be given more
+than once. 400 requests at 15 a second, and 500 at once:
+
+    python -m gsfeatloc_ros.tools.soak --seconds 120 --flood localize_image,400,15,30 --flood relocalize,500,0,80
 """
 
 from __future__ import annotations
@@ -15,10 +20,11 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from gsfeatloc_ros.client.flood import LOCALIZE_IMAGE, RELOCALIZE, Flood, FloodProcess
 from gsfeatloc_ros.client.observer import Observer
 from gsfeatloc_ros.client.process import isolate_ros, running_localizer
 from gsfeatloc_ros.client.robot import prepare_room, run_robot
-from gsfeatloc_ros.client.soak_report import summarize
+from gsfeatloc_ros.client.soak_report import add_floods, summarize
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -31,11 +37,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         target=run_robot, args=(photos_file, args.size, args.rate, args.seconds)
     )
     observer = Observer(photos_file, args.size)
+    floods = [FloodProcess(flood, photos_file, args.size) for flood in args.flood]
     try:
         with running_localizer({"map.path": map_file.resolve()}) as localizer:
             localizer.wait_until_ready()
             robot.start()
-            observer.watch(localizer.pid, robot)
+            observer.watch(localizer.pid, robot, floods)
     except (RuntimeError, TimeoutError) as error:
         print(f"soak: {error}", file=sys.stderr)
         return 1
@@ -43,12 +50,16 @@ def main(argv: Sequence[str] | None = None) -> int:
         observer.close()
         if robot.is_alive():
             robot.terminate()
+        for flood in floods:
+            flood.stop()
     record = observer.record
     if not (record.answers and record.calls):
         print("soak: the localizer gave no pose, or answered no request", file=sys.stderr)
         return 1
     size = f"{args.size[0]}x{args.size[1]}"
     result = {"size": size, "rate": args.rate} | summarize(record, args.seconds)
+    if floods:
+        add_floods(result, record, [(flood.flood, flood.replies) for flood in floods])
     print(json.dumps(result, indent=2))
     if args.json:
         samples = [vars(sample) for sample in record.samples]
@@ -65,6 +76,13 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--size", type=_size, default="640x480", help="of the images in pixels (%(default)s)")
     parser.add_argument("--rate", type=float, default=10.0, help="images a second (%(default)g)")
     parser.add_argument("--folder", type=Path, default=Path("soak"), help="keeps the map and the photos (%(default)s)")
+    parser.add_argument(
+        "--flood",
+        type=_flood,
+        action="append",
+        default=[],
+        help="SERVICE,REQUESTS,RATE,SECOND: requests on top, so many a second (0: at once), from that second on",
+    )
     parser.add_argument("--json", type=Path, help="file of the results")
     return parser.parse_args(argv)
 
@@ -74,6 +92,17 @@ def _size(text: str) -> tuple[int, int]:
     if not (cross and width.isdecimal() and height.isdecimal()):
         raise argparse.ArgumentTypeError(f"{text!r} is not WIDTHxHEIGHT")
     return int(width), int(height)
+
+
+def _flood(text: str) -> Flood:
+    try:
+        service, requests, rate, start = text.split(",")
+        flood = Flood(service, int(requests), float(rate), float(start))
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"{text!r} is not SERVICE,REQUESTS,RATE,SECOND") from error
+    if service not in (RELOCALIZE, LOCALIZE_IMAGE):
+        raise argparse.ArgumentTypeError(f"{service!r} is neither {RELOCALIZE} nor {LOCALIZE_IMAGE}")
+    return flood
 
 
 if __name__ == "__main__":

@@ -22,7 +22,7 @@ from gsfeatloc_ros.client.messages import rgb_image
 from gsfeatloc_ros.localize.protection import RISK
 
 ROOT = Path(__file__).parents[2]
-STATUSES = {"LOCALIZED": 0, "REJECTED": 1, "FAILED": 2, "REFUSED": 3, "ERROR": 4, "AMBIGUOUS": 5}
+STATUSES = {"LOCALIZED": 0, "REJECTED": 1, "FAILED": 2, "REFUSED": 3, "ERROR": 4, "AMBIGUOUS": 5, "BUSY": 6}
 
 
 def test_request_has_the_fields():

@@ -7,6 +7,8 @@ import math
 import numpy as np
 import pytest
 from node_harness import Client, assert_answer, assert_no_answer, connected_client, running_localizer
+from rcl_interfaces.srv import SetParameters
+from rclpy.parameter import Parameter
 from sensor_msgs.msg import CameraInfo, Image
 
 from gsfeatloc_ros.client.messages import camera_info_of, pose_stamped, rgb_image
@@ -169,3 +171,27 @@ def test_stream_of_unusable_images_does_not_flood_the_log(client, localizer, pho
     client.spin(0.5)
     assert 1 <= localizer.output.count("'flood' is not supported") - lines <= 4
     assert 1 <= len(client.diagnostics) - seen <= 4
+
+
+def test_a_parameter_of_no_type_is_refused_and_the_node_goes_on(client, localizer, good_info, good_prior, photo):
+    message = Parameter("max_rate", value=1.0).to_parameter_msg()
+    message.value.type = 99
+    request = SetParameters.Request(parameters=[message])
+    (result,) = client.call(SetParameters, "localizer/set_parameters", request).results
+    assert not result.successful
+    assert result.reason == "'max_rate' cannot be set: 99 is not a valid Parameter.Type"
+    send_good_inputs(client, good_info, good_prior)
+    assert_answer(client, photo)
+
+
+def test_texts_from_outside_are_cut(client, localizer, good_info, good_prior, photo):
+    before = len(localizer.output)
+    send_good_inputs(client, good_info, pose_stamped(photo.T_map_camera_prior, 1_000_000 * "x"))
+    diagnostic = assert_no_answer(client, rgb_image(photo.image), r"prior is in frame 'xxx.* \.\.\. \(\d+ characters\)")
+    assert len(diagnostic.reason) < 1100
+    answer = client.relocalize()
+    assert not answer.success
+    assert len(answer.message) < 1100
+    assert len(localizer.output) - before < 10_000
+    client.send_prior(good_prior)
+    assert_answer(client, photo)

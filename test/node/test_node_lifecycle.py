@@ -109,6 +109,34 @@ def test_start_that_cannot_be_says_why_in_one_line(room_map_file, parameters, sa
     assert_start_fails(says, **values)
 
 
+@pytest.mark.parametrize(
+    ("environment", "says"),
+    [
+        ({"HOME": None, "ROS_LOG_DIR": None, "ROS_HOME": None}, "neither ROS_LOG_DIR nor HOME is set"),
+        ({"ROS_LOG_DIR": __file__}, "which is no folder"),
+        ({"ROS_DOMAIN_ID": "abc"}, "ROS_DOMAIN_ID is 'abc': set it to a number"),
+        ({"NUMBA_NUM_THREADS": "0"}, "NUMBA_NUM_THREADS is '0'"),
+        # rclpy's word.
+        ({"ROS_LOG_DIR": "/proc/none"}, "Failed to create log directory"),
+    ],
+)
+def test_an_environment_in_which_it_cannot_start_is_said_in_one_line(room_map_file, environment, says):
+    assert_start_fails(says, environment, map__path=room_map_file)
+
+
+def test_what_nobody_foresaw_of_a_start_is_said_in_one_line(room_map_file, tmp_path):
+    """That the weights of a network are a text file torch says in six lines."""
+    (tmp_path / "weights.pth").write_text("none")
+    assert_start_fails("", map__path=room_map_file, matcher__name="xfeat", matcher__weights=tmp_path / "weights.pth")
+
+
+def test_the_transition_shutdown_ends_the_process(room_map_file):
+    with running_localizer(map__path=room_map_file, matcher__name="sift") as process, connected_client() as client:
+        assert change(client, Transition.TRANSITION_ACTIVE_SHUTDOWN)
+        assert process.wait(10.0) == 0, process.output
+        assert "Traceback" not in process.output
+
+
 def state(client: Client) -> int:
     return client.call(GetState, "localizer/get_state", GetState.Request()).current_state.id
 

@@ -49,7 +49,7 @@ def test_signal_in_the_middle_of_a_localization(room_map_file, room_camera, room
         answered = client.spin_until(lambda: running.done() and waiting.done(), END_TIMEOUT)
         assert localizer.wait(END_TIMEOUT) == 0, localizer.output
         assert "Traceback" not in localizer.output
-        assert answered, "a request was not answered"
+        assert answered, localizer.output
         for request in (running, waiting):
             assert not request.result().success
             assert "the node is stopping" in request.result().message

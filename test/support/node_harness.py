@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import re
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 
 import cv2
@@ -54,10 +54,11 @@ class NodeProcess(process.LocalizerProcess):
 
     Args:
         arguments: its command line, as of node_arguments().
+        environment: changes of this process's; None takes a variable out.
     """
 
-    def __init__(self, *arguments: str) -> None:
-        super().__init__(arguments)
+    def __init__(self, *arguments: str, environment: Mapping[str, str | None] | None = None) -> None:
+        super().__init__(arguments, environment=environment)
 
     def wait_for_output(self, pattern: str, timeout: float = TIMEOUT) -> None:
         super().wait_for_output(pattern, timeout)
@@ -95,9 +96,9 @@ def running_localizer(**parameters: object) -> Iterator[NodeProcess]:
         localizer.end()
 
 
-def assert_start_fails(says: str, **parameters: object) -> None:
+def assert_start_fails(says: str, environment: Mapping[str, str | None] | None = None, **parameters: object) -> None:
     """With these parameters the localizer ends with status 1 and one fatal line that says so."""
-    localizer = NodeProcess(*node_arguments(**parameters))
+    localizer = NodeProcess(*node_arguments(**parameters), environment=environment)
     try:
         assert localizer.wait() == 1
         lines = localizer.output.strip().splitlines()

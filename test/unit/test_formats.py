@@ -9,6 +9,7 @@ import struct
 import tracemalloc
 import zipfile
 import zlib
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -31,6 +32,7 @@ from map_files import (
 
 from gsfeatloc_ros.maps import GaussianMap, MapError, assemble, load_map
 from gsfeatloc_ros.maps.assemble import MAX_GAUSSIANS
+from gsfeatloc_ros.maps.ply import write_ply
 
 # tmp_path is shared by the examples of one test: each overwrites the files.
 same_folder = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -180,6 +182,17 @@ def test_bytes_of_no_format(tmp_path):
     refused(tmp_path / "map", "of no format that is read")
     (tmp_path / "map").write_bytes(b"hello")
     refused(tmp_path / "map", "of no format that is read")
+
+
+@pytest.mark.parametrize(("opacity", "seen"), [(1e-4, False), (0.0039, False), (0.004, True)])
+def test_a_map_in_which_nothing_can_be_seen(tmp_path, opacity, seen):
+    made = sample_map(20, 0, 0)
+    write_ply(tmp_path / "map.ply", replace(made, opacities=np.full_like(made.opacities, opacity)))
+    if seen:
+        assert len(load_map(tmp_path / "map.ply").opacities) == 20
+        return
+    with pytest.raises(MapError, match="nothing in it can be seen: none of its 20 Gaussians"):
+        load_map(tmp_path / "map.ply")
 
 
 def test_more_gaussians_than_are_read(tmp_path):

@@ -388,6 +388,38 @@ def test_a_request_s_own_camera_and_prior_go_before_what_came():
     assert position_sigma(made.for_image(image(100), prior=own).prior_covariance) > 50.0
 
 
+def test_a_request_goes_by_what_had_come_when_it_came():
+    made = inputs()
+    made.take(InputTopic.PRIOR, prior(100, T_MAP_ODOM))
+    arrived = made.newest()
+    # Of a time so much later that an image of now would be refused.
+    made.take(InputTopic.PRIOR, prior(200, np.eye(4)))
+    made.invalidate(InputTopic.CAMERA_INFO, "no camera any more")
+    taken = made.for_image(image(100), inputs=arrived)
+    np.testing.assert_allclose(taken.T_map_camera_prior, T_MAP_ODOM, atol=1e-12)
+    # What came meanwhile is newer than an answer to it.
+    made.take_answer(answer(100, T_MAP_ODOM), taken)
+    assert made.newest().prior.value.source is PriorSource.PRIOR
+    assert made.for_image(image(100), inputs=arrived.without_prior()).source is None
+    with pytest.raises(ValueError, match="no camera any more"):
+        made.for_image(image(200))
+
+
+def test_what_was_forgotten_while_a_request_waited_does_not_count():
+    made = inputs()
+    made.take_answer(answer(100, T_MAP_ODOM), made.for_image(image(100)))
+    arrived = made.newest()
+    assert made.for_image(image(100), inputs=arrived).source is PriorSource.LAST_ANSWER
+    made.forget_answer()
+    assert made.for_image(image(100), inputs=arrived).source is None
+    made.take(InputTopic.PRIOR, prior(100, T_MAP_ODOM))
+    arrived = made.newest()
+    made.forget_answer()
+    assert made.for_image(image(100), inputs=arrived).source is PriorSource.PRIOR
+    made.forget_prior()
+    assert made.for_image(image(100), inputs=arrived).source is None
+
+
 @given(a=poses, b=poses, share=st.floats(0, 1))
 def test_interpolation_turns_evenly(a, b, share):
     between = interpolate(a, b, share)

@@ -183,6 +183,9 @@ def test_nerfstudios_transforms_lead_back_to_the_frame_of_its_data(tmp_path):
     assert S_map_splat.scale == pytest.approx(1 / scale)
 
 
+LARGE_SCALE = f'{{"transform": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]], "scale": 1{400 * "0"}}}'
+
+
 @pytest.mark.parametrize(
     ("content", "match"),
     [
@@ -195,6 +198,9 @@ def test_nerfstudios_transforms_lead_back_to_the_frame_of_its_data(tmp_path):
         ('{"transform": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 2, 0]], "scale": 1}', "not a rotation"),
         ('{"transform": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, NaN]], "scale": 1}', "finite"),
         ("[" * 100_000, "is not a dataparser_transforms"),
+        # Integers of JSON are of any size.
+        (LARGE_SCALE, "not a positive number"),
+        (LARGE_SCALE.replace("[[1,", f"[[1{400 * '0'},"), "is not a dataparser_transforms"),
     ],
 )
 def test_other_files_than_nerfstudios_transforms_are_refused(tmp_path, content, match):

@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gsfeatloc_ros.common.geometry import invert, make_pose, so3_exp
+from gsfeatloc_ros.ros_io import odometry as odometry_module
 from gsfeatloc_ros.ros_io.odometry import OdometryBuffer
 
 SECOND = 1_000_000_000
@@ -123,3 +124,14 @@ def test_it_may_be_filled_while_it_is_read():
         stop.set()
         thread.join()
     assert known[0]
+
+
+def test_it_is_bounded_by_number_whatever_stamps_say(monkeypatch):
+    """A clock that hardly moves on must not fill the memory."""
+    monkeypatch.setattr(odometry_module, "_MAX_KEPT", 100)
+    odometry = OdometryBuffer(60.0)
+    for number in range(450):
+        odometry.add(SECOND + number, np.eye(4))
+    assert len(odometry._stamps) == len(odometry._poses) == len(odometry._way) <= 200
+    assert odometry.newest == SECOND + 449
+    assert odometry.motion(SECOND + 440, SECOND + 449) is not None

@@ -1,4 +1,4 @@
-"""One worker thread: requests first, then the newest of what is offered."""
+"""One worker thread: requests, and the newest of what is offered, in turns."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from concurrent.futures import CancelledError
 import pytest
 
 from gsfeatloc_ros.common.stage_clock import Interrupted
-from gsfeatloc_ros.node.worker import Worker
+from gsfeatloc_ros.node.worker import QueueLimits, Terms, UnservedError, Worker
 
 TIMEOUT = 10.0
 
@@ -69,19 +69,124 @@ def test_of_what_is_offered_the_newest_waits(gate, worker):
     gate.go.release()
 
 
-def test_all_requests_are_served_in_order_and_before_what_is_offered(gate, worker):
+def test_all_requests_are_served_in_order(gate, worker):
     first = worker.request("a")
     gate.wait_until_started()
-    worker.offer("offered")
     waiting = [worker.request(item) for item in "bcd"]
-    for _ in range(5):
+    assert worker.waiting == 3
+    for _ in range(4):
         gate.go.release()
     assert first.result(TIMEOUT) == "did a"
     assert [future.result(TIMEOUT) for future in waiting] == ["did b", "did c", "did d"]
+    assert gate.items == ["a", "b", "c", "d"]
+    assert (worker.waiting, worker.unserved) == (0, 0)
+
+
+class Sleeper:
+    """Work that takes as many seconds as its item says, and can be interrupted."""
+
+    def __init__(self):
+        self.seconds = {"offered": 0.0, "requested": 0.0}
+
+    def __call__(self, item, interrupted):
+        kind, seconds = item
+        start = time.monotonic()
+        while time.monotonic() < start + seconds:
+            time.sleep(0.001)
+            if interrupted():
+                raise Interrupted
+        self.seconds[kind] += time.monotonic() - start
+
+
+@pytest.mark.parametrize(("offered", "requested"), [(0.02, 0.02), (0.005, 0.04), (0.04, 0.005)])
+def test_where_many_come_the_stream_and_requests_get_the_same_time(offered, requested):
+    sleeper = Sleeper()
+    worker = Worker(sleeper)
+    end = time.monotonic() + 0.8
+    while time.monotonic() < end:
+        worker.offer(("offered", offered))
+        worker.request(("requested", requested), Terms(size=1))
+        time.sleep(0.005)
+    worker.stop(TIMEOUT)
+    share = sleeper.seconds["offered"] / sum(sleeper.seconds.values())
+    # The longer of the two may come off better, never much worse.
+    assert share > 0.3, sleeper.seconds
+    assert share < 0.7 or offered > requested, sleeper.seconds
+
+
+def test_no_more_requests_wait_than_the_limits_allow(gate, worker):
+    worker.limits = QueueLimits(requests=3, bytes=100)
+    worker.request("running")
+    gate.wait_until_started()
+    # One may always wait, of whatever size.
+    waiting = [worker.request("a", Terms(size=1000))]
+    with pytest.raises(UnservedError, match="1 requests of 0 MB wait"):
+        worker.request("b", Terms(size=1)).result(0)
+    worker.limits = QueueLimits(requests=3, bytes=2000)
+    waiting += [worker.request(item, Terms(size=10)) for item in "cd"]
+    with pytest.raises(UnservedError, match="3 requests"):
+        worker.request("e").result(0)
+    assert worker.unserved == 2
     for _ in range(4):
-        gate.wait_until_started()
-    assert gate.items == ["a", "b", "c", "d", "offered"]
-    assert worker.dropped == 0
+        gate.go.release()
+    assert [future.result(TIMEOUT) for future in waiting] == ["did a", "did c", "did d"]
+    assert gate.items == ["running", "a", "c", "d"]
+
+
+def test_a_request_is_told_when_its_time_is_up(gate, worker):
+    running = worker.request("running", Terms(seconds=0.1))
+    gate.wait_until_started()
+    waiting = worker.request("waiting", Terms(seconds=0.05))
+    time.sleep(0.06)
+    worker.drop_late()
+    with pytest.raises(UnservedError, match=r"not served within 0\.05 s"):
+        waiting.result(0)
+    # What runs is interrupted.
+    with pytest.raises(UnservedError, match=r"not served within 0\.1 s"):
+        running.result(TIMEOUT)
+    assert gate.items == ["running"]
+    assert worker.unserved == 2
+
+
+def test_what_nobody_waits_for_any_more_is_not_worked_on(gate, worker):
+    worker.request("running")
+    gate.wait_until_started()
+    gone = worker.request("gone", Terms(wanted=lambda: False))
+    after = worker.request("after")
+    gate.go.release()
+    gate.go.release()
+    with pytest.raises(UnservedError, match="gone"):
+        gone.result(TIMEOUT)
+    assert after.result(TIMEOUT) == "did after"
+    assert gate.items == ["running", "after"]
+
+
+def test_it_tells_for_how_long_it_is_busy(gate, worker):
+    assert worker.busy_seconds == 0.0
+    future = worker.request("a")
+    gate.wait_until_started()
+    time.sleep(0.02)
+    assert 0.02 <= worker.busy_seconds < TIMEOUT
+    gate.go.release()
+    future.result(TIMEOUT)
+
+
+def test_what_is_the_same_is_said_by_the_work():
+    started, go = threading.Event(), threading.Event()
+
+    def work(item, interrupted):
+        started.set()
+        assert go.wait(TIMEOUT)
+        return item
+
+    worker = Worker(work, lambda a, b: a[0] == b[0])
+    first = worker.request("a1")
+    assert started.wait(TIMEOUT)
+    assert worker.request("a2") is first
+    other = worker.request("b1")
+    assert worker.request("b2") is other
+    go.set()
+    assert (first.result(TIMEOUT), other.result(TIMEOUT)) == ("a1", "b1")
 
 
 def test_a_request_interrupts_what_was_offered(gate, worker):

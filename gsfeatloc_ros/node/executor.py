@@ -1,0 +1,86 @@
+"""The executor's loop, which no single message ends."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+
+# So many failures in a row, over so many seconds without one callback that ended well, and nothing is to be hoped for.
+_MAX_FAILURES = 10
+_MAX_SECONDS = 10.0
+# Seconds of rest after a failure of the loop itself: what is missing, memory say, may be there again.
+_REST = 0.1
+
+
+class HopelessError(RuntimeError):
+    """All that the executor does fails, again and again."""
+
+
+class GuardedExecutor(SingleThreadedExecutor):
+    """Goes on where a callback raises an exception, or a message cannot be taken.
+
+    rclpy lets such an exception end the process. One of the taking (no memory for a big request) leaves the topic or
+    service, and all others of its callback group, blocked for good besides.
+
+    Args:
+        on_failure: is told each exception.
+        now: seconds on a clock that runs evenly.
+        **arguments: of rclpy's executor.
+    """
+
+    def __init__(
+        self, on_failure: Callable[[Exception], None], now: Callable[[], float] = time.monotonic, **arguments: Any
+    ) -> None:
+        super().__init__(**arguments)
+        self._on_failure, self._now = on_failure, now
+        self._failures, self._failing_since = 0, 0.0
+
+    def spin_once(self, timeout_sec: float | None = None) -> None:
+        """Take and execute what is ready.
+
+        Raises:
+            HopelessError: nothing has succeeded for long; the message names the last failure.
+        """
+        try:
+            super().spin_once(timeout_sec)
+        except ExternalShutdownException:
+            raise
+        except Exception as error:
+            self._fail(error)
+            time.sleep(_REST)
+        if self._failures >= _MAX_FAILURES and self._now() - self._failing_since > _MAX_SECONDS:
+            raise HopelessError(f"{self._failures} failures in a row and no success: {self._last_failure}")
+
+    def _make_handler(self, entity: Any, node: Any, take_from_wait_list: Callable[[Any], Any]) -> Any:
+        """Make rclpy's handler, of parts that do not raise: then it leaves everything in order."""
+
+        def take(entity: Any) -> Any:
+            try:
+                execute = take_from_wait_list(entity)
+            except Exception as error:
+                self._fail(error)
+                return None
+            return None if execute is None else guarded(execute)
+
+        def guarded(execute: Callable[[], Any]) -> Callable[[], Any]:
+            async def run() -> None:
+                try:
+                    await execute()
+                except Exception as error:
+                    self._fail(error)
+                else:
+                    self._failures = 0
+
+            return run
+
+        return super()._make_handler(entity, node, take)
+
+    def _fail(self, error: Exception) -> None:
+        if not self._failures:
+            self._failing_since = self._now()
+        self._failures += 1
+        self._last_failure = f"{type(error).__name__}: {error}"
+        self._on_failure(error)

@@ -1,0 +1,153 @@
+"""The executor's loop goes on whatever a callback or a message does; no process of its own is needed."""
+
+from __future__ import annotations
+
+from contextlib import contextmanager
+
+import pytest
+import rclpy
+from rcl_interfaces.msg import ParameterType
+from rcl_interfaces.srv import SetParameters, SetParametersAtomically
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.parameter import Parameter
+from std_srvs.srv import Trigger
+
+from gsfeatloc_ros.node import executor as executor_module
+from gsfeatloc_ros.node.executor import GuardedExecutor, HopelessError
+from gsfeatloc_ros.node.parameters import refuse_unreadable
+
+
+@contextmanager
+def guarded_node(now=None):
+    """A node in a guarded executor, with the failures that this is told, and a function that makes it spin."""
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    node = rclpy.create_node("guarded", context=context)
+    failures = []
+    executor = GuardedExecutor(failures.append, *([now] if now else []), context=context)
+    executor.add_node(node)
+    try:
+        yield node, executor, failures
+    finally:
+        executor.shutdown()
+        node.destroy_node()
+        rclpy.shutdown(context=context)
+
+
+def spin_until(executor, condition) -> None:
+    for _ in range(1000):
+        if condition():
+            return
+        executor.spin_once(0.01)
+    raise AssertionError("it does not come")
+
+
+def test_a_callback_that_raises_does_not_end_the_loop():
+    with guarded_node() as (node, executor, failures):
+        ran = []
+
+        def tick() -> None:
+            ran.append(1)
+            raise KeyError("unforeseen")
+
+        node.create_timer(0.01, tick)
+        spin_until(executor, lambda: len(ran) >= 3)
+        assert [type(failure) for failure in failures] == [KeyError] * len(ran)
+
+
+def test_a_message_that_cannot_be_taken_blocks_nothing(monkeypatch):
+    """Out of memory while a request is taken: the service, and all else in its callback group, answers on."""
+    with guarded_node() as (node, executor, failures):
+        node.create_service(Trigger, "serve", lambda request, response: response)
+        client = node.create_client(Trigger, "serve")
+        spin_until(executor, client.service_is_ready)
+        taken = SingleThreadedExecutor._take_service
+
+        def no_memory(self, service):
+            if service.srv_name == "serve" and not failures:
+                taken(self, service)
+                raise MemoryError
+            return taken(self, service)
+
+        monkeypatch.setattr(SingleThreadedExecutor, "_take_service", no_memory)
+        client.call_async(Trigger.Request())
+        spin_until(executor, lambda: failures)
+        again = client.call_async(Trigger.Request())
+        spin_until(executor, again.done)
+        assert [type(failure) for failure in failures] == [MemoryError]
+
+
+def test_a_loop_in_which_nothing_succeeds_ends_with_a_reason(monkeypatch):
+    monkeypatch.setattr(executor_module, "_REST", 0.0)
+    seconds = iter(range(1000))
+    with guarded_node(lambda: float(next(seconds))) as (_, executor, failures):
+
+        def no_memory(self, *arguments):
+            raise MemoryError("no wait set")
+
+        monkeypatch.setattr(SingleThreadedExecutor, "spin_once", no_memory)
+
+        def spin() -> None:
+            for _ in range(100):
+                executor.spin_once(0.0)
+
+        with pytest.raises(HopelessError, match=r"failures in a row .* MemoryError: no wait set"):
+            spin()
+        assert 10 <= len(failures) < 30
+
+
+def test_failures_with_successes_between_are_survived(monkeypatch):
+    seconds = iter(range(10_000))
+    with guarded_node(lambda: float(next(seconds))) as (node, executor, failures):
+        ran = []
+
+        def tick() -> None:
+            ran.append(1)
+            if len(ran) % 2:
+                raise KeyError("now and then")
+
+        node.create_timer(0.001, tick)
+        spin_until(executor, lambda: len(ran) >= 50)
+        assert len(failures) >= 20
+
+
+@pytest.fixture(scope="module")
+def node():
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    node = rclpy.create_node("parameters", context=context)
+    node.declare_parameter("number", 1)
+    refuse_unreadable(node)
+    yield node
+    node.destroy_node()
+    rclpy.shutdown(context=context)
+
+
+def unreadable_parameters() -> list:
+    of_no_type = Parameter("number", value=2).to_parameter_msg()
+    of_no_type.value.type = 99
+    newer = Parameter("number", value=2).to_parameter_msg()
+    newer.value.type = ParameterType.PARAMETER_STRING_ARRAY + 1
+    unknown = Parameter("x" * 1_000_000, value=2).to_parameter_msg()
+    return [of_no_type, newer, unknown]
+
+
+def callback(node, kind):
+    return next(service.callback for service in node.services if service.srv_type is kind)
+
+
+def test_parameters_that_rclpy_cannot_read_are_refused_with_a_reason(node):
+    good = Parameter("number", value=3).to_parameter_msg()
+    bad = unreadable_parameters()
+    request = SetParameters.Request(parameters=[*bad, good])
+    results = callback(node, SetParameters)(request, SetParameters.Response()).results
+    assert [result.successful for result in results] == [False] * len(bad) + [True]
+    assert all("cannot be set: " in result.reason and len(result.reason) < 1200 for result in results[:-1])
+    assert node.get_parameter("number").value == 3
+    for parameter in bad:
+        request = SetParametersAtomically.Request(
+            parameters=[Parameter("number", value=4).to_parameter_msg(), parameter]
+        )
+        result = callback(node, SetParametersAtomically)(request, SetParametersAtomically.Response()).result
+        assert not result.successful
+    assert node.get_parameter("number").value == 3
