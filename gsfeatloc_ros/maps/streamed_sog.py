@@ -44,6 +44,8 @@ def read_streamed_sog(path: Path, meta: dict[str, Any], options: ReadOptions) ->
         raise MapError(f"{path}: is damaged or no lod-meta.json of a streamed .sog ({what})") from error
     if not units:
         raise MapError(f"{path}: holds no Gaussians at level {options.level}")
+    if missing := [unit.meta for unit in units if not unit.meta.is_file()]:
+        raise MapError(f"{path}: is a streamed .sog that lacks a file: {missing[0]} is missing")
     layouts = [describe_unbundled_sog(unit.meta) for unit in units]
     counts = [sum(end - start for start, end in _ranges(*pair)) for pair in zip(units, layouts, strict=True)]
     check_count(path, sum(counts))
