@@ -1,4 +1,4 @@
-"""COLMAP models: ``sparse/0`` in binary or text, and the photos in ``images/``.
+"""COLMAP models: ``sparse/0``, or ``sparse`` itself, in binary or text, and the photos in ``images/``.
 
 COLMAP's poses map the world into the camera, with OpenCV's axes, and its pixels have the centre of the top-left one at
 (0.5, 0.5); both are turned into this package's conventions here. As 3DGS and Mip-NeRF360 do, every eighth photo by
@@ -18,10 +18,9 @@ import numpy as np
 from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.geometry import invert, make_pose
 from gsfeatloc_ros.evaluate.colmap_files import copy_without_points
-from gsfeatloc_ros.evaluate.dataset import PosedPhoto
+from gsfeatloc_ros.evaluate.dataset import TEST_EVERY, PosedPhoto
 from gsfeatloc_ros.evaluate.extras import import_extra
 
-_TEST_EVERY = 8
 # Of each of COLMAP's models: which parameters are fx, fy, cx and cy, ours behind it, and which its coefficients are
 # (None for 0), see colmap's sensor/models.h.
 _MODELS: dict[str, tuple[tuple[int, int, int, int], str, tuple[int | None, ...]]] = {
@@ -30,6 +29,9 @@ _MODELS: dict[str, tuple[tuple[int, int, int, int], str, tuple[int | None, ...]]
     "SIMPLE_RADIAL": ((0, 0, 1, 2), "plumb_bob", (3, None, None, None)),
     "RADIAL": ((0, 0, 1, 2), "plumb_bob", (3, 4, None, None)),
     "OPENCV": ((0, 1, 2, 3), "plumb_bob", (4, 5, 6, 7)),
+    "FULL_OPENCV": ((0, 1, 2, 3), "rational_polynomial", (4, 5, 6, 7, 8, 9, 10, 11)),
+    "SIMPLE_RADIAL_FISHEYE": ((0, 0, 1, 2), "equidistant", (3, None, None, None)),
+    "RADIAL_FISHEYE": ((0, 0, 1, 2), "equidistant", (3, 4, None, None)),
     "OPENCV_FISHEYE": ((0, 1, 2, 3), "equidistant", (4, 5, 6, 7)),
 }
 
@@ -42,7 +44,8 @@ def load(folder: Path) -> tuple[list[PosedPhoto], np.ndarray]:
         RuntimeError: pycolmap is not installed.
     """
     pycolmap = import_extra("pycolmap")
-    path = folder / "sparse" / "0"
+    path = folder / "sparse"
+    path = path / "0" if (path / "0").is_dir() else path
     try:
         images = _registered(pycolmap, path)
     except OSError as error:
@@ -54,7 +57,7 @@ def load(folder: Path) -> tuple[list[PosedPhoto], np.ndarray]:
         raise ValueError(f"{path}: holds no registered image")
     cameras = {}
     photos = []
-    for image in images[::_TEST_EVERY]:
+    for image in images[::TEST_EVERY]:
         if image.camera.camera_id not in cameras:
             cameras[image.camera.camera_id] = _camera(path, image.camera)
         file = folder / "images" / image.name

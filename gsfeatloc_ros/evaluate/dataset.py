@@ -10,6 +10,9 @@ import numpy as np
 
 from gsfeatloc_ros.common.camera import Camera
 
+TEST_EVERY = 8
+"""Of data without a split, one photo of so many, by name, is for testing, as in 3DGS and Mip-NeRF360."""
+
 
 @dataclass(frozen=True, eq=False)
 class PosedPhoto:
@@ -77,16 +80,18 @@ class Scene:
 
 
 def read_image(path: Path) -> np.ndarray:
-    """Read an image as RGB or, where it has an alpha channel, RGBA: (H, W, 3 or 4) uint8.
+    """Read an image, in colour or grey, as RGB or, where it has an alpha channel, RGBA: (H, W, 3 or 4) uint8.
 
     Raises:
-        ValueError: the file is missing or not an 8-bit colour image.
+        ValueError: the file is missing or not an 8-bit image.
     """
     if not path.is_file():
         raise ValueError(f"{path}: is missing")
     pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     if pixels is None:
         raise ValueError(f"{path}: is not an image")
-    if pixels.dtype != np.uint8 or pixels.ndim != 3:
-        raise ValueError(f"{path}: is not an 8-bit colour image")
+    if pixels.dtype != np.uint8:
+        raise ValueError(f"{path}: has {8 * pixels.dtype.itemsize} bits a channel, not 8: convert it")
+    if pixels.ndim == 2:
+        return cv2.cvtColor(pixels, cv2.COLOR_GRAY2RGB)
     return cv2.cvtColor(pixels, cv2.COLOR_BGRA2RGBA if pixels.shape[2] == 4 else cv2.COLOR_BGR2RGB)

@@ -1,4 +1,7 @@
-"""Scene folders in nerfstudio's layout: ``transforms.json`` with ``test_filenames``, and the test photos.
+"""Scene folders in nerfstudio's layout: ``transforms.json`` and the test photos.
+
+``test_filenames`` are the test photos; without them those that are not in ``train_filenames`` or ``val_filenames``;
+without these every eighth by name. Intrinsics of a frame go before those at the top.
 
 nerfstudio's poses are camera-to-world with OpenGL's camera axes (y up, z backward), and its pixels have the centre of
 the top-left one at (0.5, 0.5); both are turned into this package's conventions here.
@@ -14,7 +17,16 @@ import numpy as np
 
 from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.json_file import read_json
-from gsfeatloc_ros.evaluate.dataset import PosedPhoto
+from gsfeatloc_ros.evaluate.dataset import TEST_EVERY, PosedPhoto
+
+_TEST, _OTHERS = "test_filenames", ("train_filenames", "val_filenames")
+# Of the models of nerfstudio's cameras those of a perspective camera, whose keys are the same, and the fisheye.
+_PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
+_FISHEYE = "OPENCV_FISHEYE"
+_OPENCV_KEYS = ("k1", "k2", "p1", "p2", "k3")
+_FISHEYE_KEYS = ("k1", "k2", "k3", "k4")
+# Of other programs: a rational, a thin prism's, and Metashape's coefficients.
+_NOT_MODELLED = ("k5", "k6", "s1", "s2", "s3", "s4", "b1", "b2", "p3", "p4")
 
 
 def load(folder: Path) -> tuple[list[PosedPhoto], np.ndarray]:
@@ -26,16 +38,34 @@ def load(folder: Path) -> tuple[list[PosedPhoto], np.ndarray]:
     path = folder / "transforms.json"
     with naming(path):
         transforms = read_transforms(path)
-        camera = _camera(transforms)
-        poses = {frame["file_path"]: frame_pose(frame) for frame in transforms["frames"]}
-        names = transforms["test_filenames"]
-        if not names:
-            raise ValueError("test_filenames is empty")
+        frames = {frame["file_path"]: frame for frame in transforms["frames"]}
+        if not frames:
+            raise ValueError("frames is empty")
+        poses = {name: frame_pose(frame) for name, frame in frames.items()}
+        names = _test_names(transforms, list(frames))
         unposed = [name for name in names if name not in poses]
         if unposed:
             raise ValueError(f"{len(unposed)} test photos have no frame, the first is {unposed[0]}")
-    photos = [PosedPhoto(Path(name).name, folder / name, camera, poses[name]) for name in names]
+        photos = [
+            PosedPhoto(Path(name).name, folder / name, _camera(transforms | frames[name]), poses[name])
+            for name in names
+        ]
     return photos, np.array(list(poses.values()))
+
+
+def _test_names(transforms: dict, names: list[str]) -> list[str]:
+    """Return the names of the test photos out of those of all."""
+    if _TEST in transforms:
+        if not transforms[_TEST]:
+            raise ValueError(f"{_TEST} is empty")
+        return transforms[_TEST]
+    others = {name for key in _OTHERS for name in transforms.get(key, ())}
+    if others:
+        left = [name for name in names if name not in others]
+        if not left:
+            raise ValueError(f"it has no {_TEST}, and {' and '.join(_OTHERS)} leave no frame")
+        return left
+    return sorted(names)[::TEST_EVERY]
 
 
 def load_poses(path: Path) -> np.ndarray:
@@ -79,16 +109,27 @@ def frame_pose(frame: dict) -> np.ndarray:
     return T_map_opengl @ np.diag([1.0, -1.0, -1.0, 1.0])
 
 
-def _camera(transforms: dict) -> Camera:
-    model = transforms.get("camera_model", "OPENCV")
-    if model not in ("OPENCV", "PINHOLE"):
-        raise ValueError(f"camera_model {model} is not OPENCV or PINHOLE")
+def _camera(intrinsics: dict) -> Camera:
+    """Return the camera by its keys, of which a lens that cannot be modelled is refused by name."""
+    fisheye, model = intrinsics.get("is_fisheye", False), intrinsics.get("camera_model")
+    if fisheye and model not in (None, _FISHEYE):
+        raise ValueError(f"is_fisheye is true, but camera_model is {model}: remove the one that is wrong")
+    model = model or (_FISHEYE if fisheye else "OPENCV")
+    if model not in (*_PERSPECTIVE, _FISHEYE):
+        raise ValueError(f"camera_model {model} is not one of {', '.join((*_PERSPECTIVE, _FISHEYE))}")
+    names, unused = (_FISHEYE_KEYS, _OPENCV_KEYS) if model == _FISHEYE else (_OPENCV_KEYS, _FISHEYE_KEYS)
+    beyond = [key for key in (*unused, *_NOT_MODELLED) if key not in names and intrinsics.get(key)]
+    if beyond:
+        raise ValueError(
+            f"{', '.join(beyond)} of a lens of camera_model {model} cannot be used: undistort the photos first"
+        )
     K = np.array(
         [
-            [transforms["fl_x"], 0.0, transforms["cx"] - 0.5],
-            [0.0, transforms["fl_y"], transforms["cy"] - 0.5],
+            [intrinsics["fl_x"], 0.0, intrinsics["cx"] - 0.5],
+            [0.0, intrinsics["fl_y"], intrinsics["cy"] - 0.5],
             [0.0, 0.0, 1.0],
         ]
     )
-    distortion = [transforms.get(name, 0.0) for name in ("k1", "k2", "p1", "p2", "k3")]
-    return Camera(int(transforms["w"]), int(transforms["h"]), K, np.array(distortion))
+    distortion = np.array([intrinsics.get(key, 0.0) for key in names])
+    ros_model = "equidistant" if model == _FISHEYE else "plumb_bob"
+    return Camera(int(intrinsics["w"]), int(intrinsics["h"]), K, distortion, ros_model)

@@ -30,7 +30,8 @@ class Combinations:
     """Settings of which all combinations are run.
 
     Attributes:
-        scenes: folders with their maps; None for the map in the folder.
+        scenes: folders with their maps, None for the map in the folder, and nerfstudio's files of where these lie, None
+            where they lie in the scene's frame.
         conditions: what is done to the photos, priors and maps.
         priors_file: for the protocol PRIORS_FILE.
         max_width: as in Run, one for all.
@@ -39,7 +40,7 @@ class Combinations:
         methods, matchers, sigmas, seeds, ablations: as in Run.
     """
 
-    scenes: Sequence[tuple[Path, Path | None]]
+    scenes: Sequence[tuple[Path, Path | None, Path | None]]
     conditions: Sequence[Condition]
     priors_file: Path | None
     methods: Sequence[str]
@@ -54,7 +55,7 @@ class Combinations:
     def runs(self) -> list[Run]:
         """Return all combinations, those next to each other that need the same map and matcher."""
         values = [[(name, value) for value in values] for name, values in self.options.items()]
-        folders = [scene for scene, _ in self.scenes]
+        folders = [scene for scene, _, _ in self.scenes]
         return [
             Run(
                 scene=scene,
@@ -72,8 +73,9 @@ class Combinations:
                 degradation=condition.degradation,
                 negative=negative,
                 index=self.index or ("map" if condition.protocol in WITHOUT_PRIOR else "none"),
+                dataparser_transforms=dataparser_transforms,
             )
-            for scene, map_path in self.scenes
+            for scene, map_path, dataparser_transforms in self.scenes
             for degradation in dict.fromkeys(condition.degradation for condition in self.conditions)
             for matcher, method, sigma, seed in itertools.product(self.matchers, self.methods, self.sigmas, self.seeds)
             # The published recipe has no options and is taken whole.

@@ -1,15 +1,19 @@
 """Priors from another system, such as a 6DGS or odometry run, in a file.
 
-TUM: lines ``NAME tx ty tz qx qy qz qw`` (what starts with # is a comment); CSV, with the suffix .csv: a header with the
-columns ``name,tx,ty,tz,qx,qy,qz,qw`` in any order. The poses are of the camera's optical frame in the map's. NAME, for
-TUM usually a stamp, is the name of the photo's file, with or without its extension.
+TUM: lines ``NAME tx ty tz qx qy qz qw``, with commas between them if you like (what starts with # is a comment).
+CSV, with the suffix .csv: a header with the columns ``name,tx,ty,tz,qx,qy,qz,qw`` in any order. As Excel writes it, it
+is read too: with a byte order mark, in UTF-16, with semicolons or tabs, and then with decimal commas.
+
+The poses are of the camera's optical frame in the map's. NAME, for TUM usually a stamp, is the name of the photo's
+file, with or without its extension.
 """
 
 from __future__ import annotations
 
+import codecs
 import csv
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +22,7 @@ from gsfeatloc_ros.common.geometry import make_pose, matrix_from_quaternion
 from gsfeatloc_ros.evaluate.dataset import Scene
 from gsfeatloc_ros.evaluate.protocol import PhotoPrior
 
+_DELIMITERS = (",", ";", "\t")
 _NUMBERS = ("tx", "ty", "tz", "qx", "qy", "qz", "qw")
 
 
@@ -33,10 +38,10 @@ def read_priors(path: Path, scene: Scene) -> list[PhotoPrior]:
     indices |= {photo.name: index for index, photo in enumerate(scene.photos)}
     poses = []
     try:
-        with path.open(encoding="utf-8", newline="") as file:
-            for number, name, values in _csv_lines(file) if path.suffix == ".csv" else _tum_lines(file):
-                if name in indices:
-                    poses.append((indices[name], _pose(number, values)))
+        lines = _text(path.read_bytes()).splitlines()
+        for number, name, values in _csv_lines(lines) if path.suffix.lower() == ".csv" else _tum_lines(lines):
+            if name in indices:
+                poses.append((indices[name], _pose(number, values)))
     except OSError as error:
         raise ValueError(f"{path}: cannot be read: {error.strerror}") from error
     except ValueError as error:
@@ -51,21 +56,34 @@ def read_priors(path: Path, scene: Scene) -> list[PhotoPrior]:
     return priors
 
 
-def _tum_lines(file: Iterator[str]) -> Iterator[tuple[int, str, list[str]]]:
+def _text(data: bytes) -> str:
+    """Return the text of a file by its byte order mark; without one it is UTF-8."""
+    return data.decode("utf-16" if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) else "utf-8-sig")
+
+
+def _tum_lines(lines: Sequence[str]) -> Iterator[tuple[int, str, list[str]]]:
     """Yield number, name and the seven values of each line."""
-    for number, line in enumerate(file, start=1):
-        fields = line.partition("#")[0].split()
+    for number, line in enumerate(lines, start=1):
+        fields = line.partition("#")[0].replace(",", " ").split()
         if fields:
             yield number, fields[0], fields[1:]
 
 
-def _csv_lines(file: Iterator[str]) -> Iterator[tuple[int, str, list[str]]]:
-    reader = csv.DictReader(file, skipinitialspace=True)
-    missing = [name for name in ("name", *_NUMBERS) if name not in (reader.fieldnames or ())]
+def _csv_lines(lines: Sequence[str]) -> Iterator[tuple[int, str, list[str]]]:
+    # Excel's own way to name the delimiter.
+    first = int(bool(lines) and lines[0].lower().startswith("sep="))
+    header = lines[first] if len(lines) > first else ""
+    delimiter = max(_DELIMITERS, key=header.count)
+    reader = csv.DictReader(lines[first:], delimiter=delimiter, skipinitialspace=True)
+    reader.fieldnames = [name.strip().lower() for name in reader.fieldnames or ()]
+    missing = [name for name in ("name", *_NUMBERS) if name not in reader.fieldnames]
     if missing:
         raise ValueError(f"the header lacks {', '.join(missing)}")
     for row in reader:
-        yield reader.line_num, row["name"], [row[name] for name in _NUMBERS]
+        values = [row[name] for name in _NUMBERS]
+        if delimiter != ",":
+            values = [value and value.replace(",", ".") for value in values]
+        yield first + reader.line_num, row["name"].strip(), values
 
 
 def _pose(number: int, values: list[str]) -> np.ndarray:

@@ -155,11 +155,12 @@ def hash_photos(scene: Scene) -> str:
 
 
 def fingerprint_of(run: Run, scene: SceneHash, priors: Iterable[PhotoPrior]) -> Fingerprint:
-    """Return the fingerprint of a run in a scene."""
+    """Return the fingerprint of a run in a scene; raise OSError where the file of where its map lies cannot be read."""
+    placed = run.dataparser_transforms
     return Fingerprint(
         settings=run.settings(),
         code=_code(),
-        map=scene.map,
+        map=scene.map if placed is None else _digest([scene.map.encode(), placed.read_bytes()]),
         photos=scene.photos,
         priors=_digest(prior.T_map_camera.tobytes() for prior in priors),
     )

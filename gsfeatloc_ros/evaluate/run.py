@@ -65,6 +65,7 @@ class Run:
         degradation: the one of DEGRADATIONS that is done to the map, or "".
         negative: what the photos are in place of the scene's own: one of NEGATIVES, the folder of another scene, or "".
         index: the one of INDICES in which method "default" looks for what the prior does not show.
+        dataparser_transforms: nerfstudio's file, of a map in the frame that nerfstudio trained it in; else None.
     """
 
     scene: Path
@@ -82,6 +83,7 @@ class Run:
     degradation: str = ""
     negative: str = ""
     index: str = "none"
+    dataparser_transforms: Path | None = None
 
     def settings(self) -> dict[str, Any]:
         """Return the same, ready for JSON."""
@@ -114,18 +116,23 @@ class Task:
     def drawn_map(self) -> DrawnMap:
         """The map that it is localized in."""
         run = self.run
-        return DrawnMap(run.scene, run.map_path, self.version, run.degradation, run.seed if run.degradation else 0)
+        seed = run.seed if run.degradation else 0
+        return DrawnMap(run.scene, run.map_path, self.version, run.degradation, seed, run.dataparser_transforms)
 
 
 @dataclass(frozen=True)
 class DrawnMap:
-    """A map that is drawn: of a scene in the version of its files, with a degradation ("" for none) and its seed."""
+    """A map that is drawn: of a scene in the version of its files, with a degradation ("" for none) and its seed.
+
+    The last is nerfstudio's file of where it lies, if there is one.
+    """
 
     scene: Path
     map_path: Path | None
     version: str
     degradation: str = ""
     seed: int = 0
+    dataparser_transforms: Path | None = None
 
 
 def draw_priors(run: Run, scene: Scene) -> list[PhotoPrior]:
@@ -218,9 +225,12 @@ def open_renderer(drawn: DrawnMap, threads: int = 0) -> Renderer:
     scene, settings = open_scene(drawn.scene, drawn.map_path, drawn.version), RendererSettings(threads=threads)
     if drawn.degradation:
         return load_degraded_renderer(
-            scene, settings, partial(degrade, drawn.degradation, scene=scene, seed=drawn.seed)
+            scene,
+            settings,
+            partial(degrade, drawn.degradation, scene=scene, seed=drawn.seed),
+            drawn.dataparser_transforms,
         )
-    return load_scene_renderer(scene, settings)
+    return load_scene_renderer(scene, settings, drawn.dataparser_transforms)
 
 
 @lru_cache(maxsize=1)

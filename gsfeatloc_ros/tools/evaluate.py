@@ -101,11 +101,13 @@ def _record_path(options: argparse.Namespace) -> Path | None:
 
 def _combinations(options: argparse.Namespace) -> Combinations:
     """Return the settings that the options name."""
-    maps = options.map or [None] * len(options.scene)
+    none = [None] * len(options.scene)
     return Combinations(
         scenes=[
-            (scene.resolve(), map_path and map_path.resolve())
-            for scene, map_path in zip(options.scene, maps, strict=True)
+            (scene.resolve(), *(path and path.resolve() for path in paths))
+            for scene, *paths in zip(
+                options.scene, options.map or none, options.dataparser_transforms or none, strict=True
+            )
         ],
         conditions=_conditions(options),
         priors_file=options.priors and options.priors.resolve(),
@@ -140,9 +142,16 @@ def _parser() -> argparse.ArgumentParser:
         "scene",
         type=Path,
         nargs="+",
-        help="folder with a map, photos and transforms.json, transforms_test.json or sparse/0",
+        help="folder with a map, photos and transforms.json, transforms_test.json or COLMAP's sparse",
     )
     parser.add_argument("--map", type=Path, action="append", help="map of the scene; once for each scene")
+    parser.add_argument(
+        "--dataparser-transforms",
+        type=Path,
+        action="append",
+        metavar="FILE",
+        help="nerfstudio's, of a map that it has trained; once for each scene",
+    )
     parser.add_argument(
         "--protocol",
         type=_names((*PROTOCOLS, PRIORS_FILE)),
@@ -228,8 +237,9 @@ def _check(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None
     for name, path in (("--json", options.json), ("--report", options.report)):
         if path and not path.absolute().parent.is_dir():
             parser.error(f"{name} {path}: there is no folder {path.absolute().parent}")
-    if options.map and len(options.map) != len(options.scene):
-        parser.error(f"--map: {len(options.map)} maps for {len(options.scene)} scenes")
+    for name, paths in (("--map", options.map), ("--dataparser-transforms", options.dataparser_transforms)):
+        if paths and len(paths) != len(options.scene):
+            parser.error(f"{name}: {len(paths)} files for {len(options.scene)} scenes")
     own = ("protocol", "corruption", "degrade")
     if options.suite and (chosen := [name for name in own if getattr(options, name) != parser.get_default(name)]):
         parser.error(f"--suite {options.suite} has its own --{chosen[0]}")

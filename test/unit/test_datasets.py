@@ -4,6 +4,7 @@ import json
 import shutil
 import sys
 
+import cv2
 import numpy as np
 import pycolmap
 import pytest
@@ -93,7 +94,11 @@ def test_photo_with_alpha_lies_on_white(tmp_path, transforms):
         ({"fl_x": None}, "transforms.json"),
         ({"fl_x": 0.0}, "focal"),
         ({"w": 0}, "size"),
-        ({"camera_model": "OPENCV_FISHEYE"}, "OPENCV_FISHEYE"),
+        ({"camera_model": "EQUIRECTANGULAR"}, "camera_model EQUIRECTANGULAR is not one of"),
+        ({"is_fisheye": True, "camera_model": "OPENCV"}, "is_fisheye is true, but camera_model is OPENCV"),
+        ({"k4": 0.01}, "k4 of a lens of camera_model OPENCV cannot be used: undistort"),
+        ({"is_fisheye": True, "p1": 0.01}, "p1 of a lens of camera_model OPENCV_FISHEYE cannot be used"),
+        ({"train_filenames": ["images/a.png", "images/b.png"], "test_filenames": None}, "transforms.json"),
         ({"test_filenames": []}, "test_filenames is empty"),
         ({"test_filenames": ["images/c.png"]}, "1 test photos have no frame, the first is images/c.png"),
         ({"test_filenames": ["images/a.png"]}, r"1 of 1 test photos are missing, the first is a\.png"),
@@ -109,7 +114,7 @@ def test_scene_that_cannot_be_used(tmp_path, transforms, change, message):
         load_scene(save_scene(tmp_path, transforms | change))
 
 
-@pytest.mark.parametrize("key", ["fl_x", "cy", "w", "frames", "test_filenames"])
+@pytest.mark.parametrize("key", ["fl_x", "cy", "w", "frames"])
 def test_missing_key_is_named(tmp_path, transforms, key):
     del transforms[key]
     with pytest.raises(ValueError, match=f"lacks the key '{key}'"):
@@ -126,14 +131,71 @@ def test_transforms_that_are_not_an_object(tmp_path, content):
 @pytest.mark.parametrize("there", [False, True])
 def test_folder_that_is_no_scene(tmp_path, there):
     folder = tmp_path if there else tmp_path / "nowhere"
-    with pytest.raises(ValueError, match=r"holds none of transforms\.json, transforms_test\.json, sparse/0"):
+    with pytest.raises(ValueError, match=r"holds none of transforms\.json, transforms_test\.json, sparse"):
         load_scene(folder)
 
 
-def test_photo_of_another_size(tmp_path, transforms):
-    scene = load_scene(save_scene(tmp_path, transforms, np.zeros((3, 4, 3), np.uint8)))
-    with pytest.raises(ValueError, match=r"4x3.*8x6"):
+@pytest.mark.parametrize(("width", "height"), [(4, 3), (16, 12), (3, 2)])  # the last is rounded
+def test_cameras_are_of_the_size_of_the_photos(tmp_path, transforms, width, height):
+    scene = load_scene(save_scene(tmp_path, transforms, np.zeros((height, width, 3), np.uint8)))
+    assert scene.read_photo(scene.photos[0]).shape == (height, width, 3)
+    assert scene.camera.K[0, 0] == pytest.approx(10 * width / 8)
+    # Its middle stays where it is.
+    assert scene.camera.K[0, 2] == pytest.approx((width - 1) / 2)
+
+
+def test_photo_of_another_shape(tmp_path, transforms):
+    scene = load_scene(save_scene(tmp_path, transforms, np.zeros((4, 4, 3), np.uint8)))
+    with pytest.raises(ValueError, match=r"4x4.*8x6"):
         scene.read_photo(scene.photos[0])
+
+
+def test_grey_photo(tmp_path, transforms):
+    folder = save_scene(tmp_path, transforms)
+    grey = np.arange(48, dtype=np.uint8).reshape(6, 8)
+    cv2.imwrite(str(folder / "images/b.png"), grey)
+    scene = load_scene(folder)
+    np.testing.assert_array_equal(scene.read_photo(scene.photos[0]), np.stack([grey] * 3, axis=2))
+    cv2.imwrite(str(folder / "images/b.png"), grey.astype(np.uint16))
+    with pytest.raises(ValueError, match=r"b\.png: has 16 bits a channel, not 8"):
+        load_scene(folder)
+
+
+def test_intrinsics_of_a_frame_go_before_those_at_the_top(tmp_path, transforms):
+    transforms["frames"][1] |= {"fl_x": 20.0, "cx": 3.0, "k1": 0.1}
+    scene = load_scene(save_scene(tmp_path, transforms))
+    np.testing.assert_array_equal(scene.camera.K, [[20, 0, 2.5], [0, 11, 2.5], [0, 0, 1]])
+    assert scene.camera.distortion[0] == 0.1
+
+
+def test_intrinsics_of_frames_alone(tmp_path, transforms):
+    keys = ("fl_x", "fl_y", "cx", "cy", "w", "h")
+    own = {key: transforms.pop(key) for key in keys}
+    transforms["frames"][1] |= own  # the frame of the test photo; others need none
+    np.testing.assert_array_equal(load_scene(save_scene(tmp_path, transforms)).camera.K[0], [10, 0, 3.5])
+
+
+@pytest.mark.parametrize("named", [{"is_fisheye": True}, {"camera_model": "OPENCV_FISHEYE"}])
+def test_a_fisheye_is_one(tmp_path, transforms, named):
+    coefficients = {"k1": 0.1, "k2": 0.2, "k3": 0.3, "k4": 0.4}
+    camera = load_scene(save_scene(tmp_path, transforms | named | coefficients)).camera
+    assert camera.model == "equidistant"
+    np.testing.assert_array_equal(camera.distortion, [0.1, 0.2, 0.3, 0.4])
+
+
+def test_without_a_split_every_eighth_photo_is_for_testing(tmp_path, transforms):
+    del transforms["test_filenames"], transforms["train_filenames"]
+    frame = transforms["frames"][0]
+    transforms["frames"] = [frame | {"file_path": f"images/{number:02}.png"} for number in reversed(range(17))]
+    folder = save_scene(tmp_path, transforms)
+    for number in (0, 8, 16):
+        save_image(folder / f"images/{number:02}.png", np.zeros((6, 8, 3), np.uint8))
+    assert [photo.name for photo in load_scene(folder).photos] == ["00.png", "08.png", "16.png"]
+
+
+def test_without_test_photos_they_are_those_that_made_no_map(tmp_path, transforms):
+    del transforms["test_filenames"]
+    assert [photo.name for photo in load_scene(save_scene(tmp_path, transforms)).photos] == ["b.png"]
 
 
 def test_photo_that_is_not_an_image(tmp_path, transforms):
@@ -284,6 +346,9 @@ def test_colmap(tmp_path, room_map_file, small_camera, small_photos, localizer, 
         ("SIMPLE_RADIAL", [300, 161, 118, -0.12]),
         ("RADIAL", [300, 161, 118, -0.12, 0.03]),
         ("OPENCV", [300, 310, 161, 118, -0.12, 0.03, 0.002, -0.001]),
+        ("FULL_OPENCV", [300, 310, 161, 118, -0.12, 0.03, 0.002, -0.001, 0.004, 0.02, 0.01, -0.003]),
+        ("SIMPLE_RADIAL_FISHEYE", [200, 161, 118, -0.02]),
+        ("RADIAL_FISHEYE", [200, 161, 118, -0.02, 0.004]),
         ("OPENCV_FISHEYE", [200, 210, 161, 118, -0.02, 0.004, -0.001, 0.0005]),
     ],
 )
@@ -297,6 +362,17 @@ def test_colmap_cameras_see_what_colmap_says(tmp_path, model, parameters):
     # COLMAP has the centre of the top-left pixel at (0.5, 0.5).
     pixels = theirs.img_from_cam(points) - 0.5
     np.testing.assert_allclose(camera.rays(camera.undistort(pixels)), points, atol=1e-6)
+
+
+def test_colmap_without_a_folder_0(tmp_path):
+    write_colmap(tmp_path, [("PINHOLE", 8, 6, [4, 4, 4, 3])], [("a.png", 0, np.eye(4))])
+    for file in (tmp_path / "sparse/0").iterdir():
+        file.rename(tmp_path / "sparse" / file.name)
+    (tmp_path / "sparse/0").rmdir()
+    save_image(tmp_path / "images/a.png", np.zeros((3, 4, 3), np.uint8))
+    scene = load_scene(tmp_path, "map.ply")
+    # The photo is half as large as its model's camera, whose middle is at 4 where the corner is at 0.
+    np.testing.assert_allclose(scene.camera.K, [[2, 0, 1.5], [0, 2, 1], [0, 0, 1]], atol=1e-9)
 
 
 def test_colmap_with_several_cameras(tmp_path):

@@ -250,6 +250,28 @@ def test_priors_file_that_cannot_be_used(tmp_path, scene, name, text, message):
         read_priors(path, scene)
 
 
+@pytest.mark.parametrize(
+    ("name", "data"),
+    [
+        pytest.param("a.txt", "\ufeff0.5 1.5 0 0 0 0 0 1 \r\n".encode(), id="byte order mark"),
+        pytest.param("a.txt", b"0.5, 1.5, 0, 0, 0, 0, 0, 1\n", id="commas"),
+        pytest.param("a.txt", "0.5\t1.5\t0\t0\t0\t0\t0\t1".encode("utf-16"), id="UTF-16"),
+        pytest.param("A.CSV", b"Name,tx,ty,tz,qx,qy,qz,qw\r\n0.5,1.5,0,0,0,0,0,1\r\n", id="capitals"),
+        pytest.param(
+            "a.csv", "\ufeffname;tx;ty;tz;qx;qy;qz;qw\r\n0.5;1,5;0;0;0;0;0;1\r\n".encode(), id="decimal commas"
+        ),
+        pytest.param("a.csv", b"sep=;\nname;tx;ty;tz;qx;qy;qz;qw\n0.5;1.5;0;0;0;0;0;1\n", id="named delimiter"),
+        pytest.param(
+            "a.csv", "name\ttx\tty\ttz\tqx\tqy\tqz\tqw\n0.5\t1,5\t0\t0\t0\t0\t0\t1".encode("utf-16"), id="Unicode text"
+        ),
+    ],
+)
+def test_priors_files_as_windows_and_excel_write_them(tmp_path, scene, name, data):
+    (tmp_path / name).write_bytes(data)
+    (prior,) = read_priors(tmp_path / name, scene)
+    np.testing.assert_allclose(prior.T_map_camera, make_pose(np.eye(3), [1.5, 0, 0]), atol=1e-12)
+
+
 def test_priors_file_that_is_not_there(tmp_path, scene):
     with pytest.raises(ValueError, match=r"a\.txt: cannot be read: No such file"):
         read_priors(tmp_path / "a.txt", scene)

@@ -214,7 +214,7 @@ def test_the_suite_goes_on_where_it_was(trust, capsys):
 
 
 def test_in_the_suite_the_photos_of_each_scene_are_looked_for_in_all_others():
-    scenes = [(Path(f"/scenes/{name}"), None) for name in ("bonsai", "lego", "office")]
+    scenes = [(Path(f"/scenes/{name}"), None, None) for name in ("bonsai", "lego", "office")]
     conditions = SUITES["trust"]
     runs = Combinations(scenes, conditions, None, ["default"], ["sift"], [1.0], [0, 1], 640, {}).runs()
     assert len(runs) == len(set(runs)) == 2 * (3 * (len(conditions) - 1) + 6)
@@ -401,7 +401,8 @@ def test_nothing_that_is_measured_imports_what_no_result_depends_on():
         (["--jobs", "0"], "'0' is not a number of at least 1"),
         (["--protocol", "priors-file"], "--priors and --protocol priors-file need each other"),
         (["--priors", "a.txt"], "--priors and --protocol priors-file need each other"),
-        (["--map", "a.ply", "--map", "b.ply"], "2 maps for 1 scenes"),
+        (["--map", "a.ply", "--map", "b.ply"], "--map: 2 files for 1 scenes"),
+        (["--dataparser-transforms", "a", "--dataparser-transforms", "b"], "transforms: 2 files for 1 scenes"),
         (["--report", "/nowhere/at/all"], "--report /nowhere/at/all: there is no folder /nowhere/at"),
     ],
 )
