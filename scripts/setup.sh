@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
 # Make .venv with all that `make demo` and `make test` need; quick when there is nothing to do.
 #   PYTHON=python3.12 scripts/setup.sh     takes that Python instead of looking for one
+#   TORCH=pypi scripts/setup.sh            takes PyPI's own torch where the CPU build is not to be had
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 . scripts/ros.sh
@@ -8,6 +9,7 @@ cd "$(dirname "${BASH_SOURCE[0]}")/.."
 # The +cpu build is named in full: no index can then put gigabytes of CUDA in its place.
 cpu_torch="torch==2.13.0+cpu"
 any_torch="torch>=2.5.1,<3"
+pypi_torch_size="2.7 GB to download"
 cpu_torch_index="https://download.pytorch.org/whl/cpu"
 
 fail() {
@@ -45,9 +47,10 @@ make_venv() {
 install_torch() {
     if has_gpu; then
         pip_install "$any_torch"
-    elif ! pip_install "$cpu_torch" 2>/dev/null; then
-        pip_install --index-url "$cpu_torch_index" "$cpu_torch" \
-            || fail "no $cpu_torch for $(.venv/bin/python -V) at pip's indexes nor at $cpu_torch_index. Nothing else is taken: PyPI's torch brings gigabytes of CUDA."
+    elif ! pip_install "$cpu_torch" 2>/dev/null && ! pip_install --index-url "$cpu_torch_index" "$cpu_torch"; then
+        [ "${TORCH:-}" = pypi ] \
+            || fail "no $cpu_torch for $(.venv/bin/python -V) at pip's indexes nor at $cpu_torch_index. PyPI's own torch serves as well, but brings CUDA, $pypi_torch_size: TORCH=pypi takes it (make TORCH=pypi)."
+        pip_install "$any_torch"
     fi
     # Keeps the installations below from replacing it.
     .venv/bin/python -c 'from importlib.metadata import version; print("torch==" + version("torch"))' >>.venv/constraints.txt
