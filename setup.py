@@ -35,11 +35,13 @@ setup(
         "backports.zstd>=1.0,<2",  # .spz of version 4; in the standard library from Python 3.14 on
         "faiss-cpu>=1.9,<2",  # nearest neighbours among the features of an index of views
         "kornia>=0.9,<0.10",  # the first whose LoFTR gives an image's features apart
+        "mcap>=1.2,<2",
         "numba>=0.60,<0.70",
         "numpy>=1.26,<3",
         "opencv-python-headless>=4.8,<6",
         "plyfile>=1.0,<2",
         "poselib>=2.0.4,<3",
+        "pyyaml>=6,<7",
         "rosbags>=0.11,<0.12",
         "scipy>=1.11,<2",
         "torch>=2.5.1,<3",
@@ -89,8 +91,8 @@ setup(
             "hypothesis>=6.100,<7",
             "mypy>=1.13,<2",
             "pytest>=8,<9",
-            "pyyaml>=6,<7",
             "ruff>=0.9,<1",
+            "types-pyyaml>=6,<7",
         ],
     },
 )

@@ -18,7 +18,7 @@ from std_srvs.srv import Empty
 from gsfeatloc_ros.client.client_node import ClientNode
 from gsfeatloc_ros.client.messages import pose_matrix, read_diagnostics, stamp_of
 from gsfeatloc_ros.client.process import START_TIMEOUT
-from gsfeatloc_ros.node.qos import LATCHED
+from gsfeatloc_ros.node.qos import LATCHED, Topic
 
 # Seconds from a photo's prior and camera info to the photo itself: topics have no order, and it must not overtake them.
 # (To wait for their acknowledgment would take seconds: it comes with Fast DDS's heartbeat.)
@@ -29,11 +29,12 @@ _SETTLING = 0.5
 
 @dataclass(frozen=True)
 class Topics:
-    """Names of the topics in the bag, to which the localizer listens too."""
+    """Names of the topics in the bag, to which the localizer listens too; others with their types, such as tf."""
 
     image: str
     camera_info: str
     prior: str
+    others: tuple[Topic, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,6 +134,8 @@ class _Player(ClientNode):
         self._evidence: dict[str, dict[str, str]] = {}
         types = {topics.image: Image, topics.camera_info: CameraInfo, topics.prior: PoseStamped}
         self.publishers = {topic: self.node.create_publisher(kind, topic, 10) for topic, kind in types.items()}
+        for other in topics.others:
+            self.publishers[other.name] = self.node.create_publisher(other.message_type, other.name, other.qos)
         self._lose = self.node.create_client(Empty, "reinitialize_global_localization")
         self._subscriptions = (
             self.node.create_subscription(PoseWithCovarianceStamped, "pose", self._on_pose, LATCHED),

@@ -16,6 +16,8 @@ Settings = TypeVar("Settings")
 Value = str | bool | int | float | tuple[float, ...]
 
 _KEY, _GROUP = "parameter", "group"
+# What people call the types.
+_KINDS = {str: "text", bool: "truth (true, false)", int: "whole number", float: "number", tuple: "list of numbers"}
 
 
 @dataclass(frozen=True)
@@ -47,6 +49,26 @@ class Parameter:
         """Return a value as it is in settings: a boolean as the choice of that name."""
         return str(value).lower() if self.is_switch and isinstance(value, bool) else value
 
+    def converted(self, value: object) -> Value:
+        """Return a value as one of the parameter's type: a whole number is a number, a list a tuple of them.
+
+        Raises:
+            ValueError: it is of another type, out of range, or not one of the choices.
+        """
+        kind = type(self.default)
+        if isinstance(value, bool):
+            value = self.as_set(value)
+        if isinstance(value, list | tuple) and kind is tuple and all(type(item) in (int, float) for item in value):
+            return tuple(float(item) for item in value)
+        if kind is float and type(value) is int:
+            value = float(value)
+        if type(value) is not kind:
+            raise ValueError(f"parameter {self.name}: {value!r} is no {_KINDS[kind]}")
+        if self.bounds and isinstance(value, int | float) and not self.bounds[0] <= value <= self.bounds[1]:
+            raise ValueError(f"parameter {self.name}: {value} is not within {self.bounds[0]:g} and {self.bounds[1]:g}")
+        self.check(value)
+        return value
+
     def check(self, value: Value) -> None:
         """Raise ValueError where `value`, as it is in settings, is not one of the choices."""
         if self.choices and value not in self.choices:
@@ -77,6 +99,18 @@ def parameters_of(settings: type, prefix: str = "") -> Iterator[Parameter]:
             yield replace(item.metadata[_KEY], name=prefix + item.name)
         elif is_dataclass(item.default_factory):
             yield from parameters_of(cast(type, item.default_factory), item.metadata.get(_GROUP, prefix))
+
+
+def values_of(settings: object, prefix: str = "") -> dict[str, Value]:
+    """Return the parameter values of a settings dataclass by name, as `settings_from` takes them."""
+    values: dict[str, Value] = {}
+    for item in fields(cast(Any, settings)):
+        value = getattr(settings, item.name)
+        if _KEY in item.metadata:
+            values[prefix + item.name] = value
+        elif is_dataclass(item.default_factory):
+            values |= values_of(value, item.metadata.get(_GROUP, prefix))
+    return values
 
 
 def settings_from(settings: type[Settings], values: Mapping[str, Value], prefix: str = "") -> Settings:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rcl_interfaces.msg import Parameter as ParameterMessage
@@ -61,7 +62,7 @@ def declare_parameters(node: Node) -> Settings:
 
 def read_settings(node: Node) -> Settings:
     """Return the values of all parameters, which are declared."""
-    values = {name: item.as_set(node.get_parameter(name).value) for name, item in _BY_NAME.items()}
+    values: dict[str, Any] = {name: item.as_set(node.get_parameter(name).value) for name, item in _BY_NAME.items()}
     lists = {name: tuple(values[name]) for name, item in _BY_NAME.items() if isinstance(item.default, tuple)}
     return Settings.of(values | lists)
 

@@ -13,13 +13,10 @@ from rclpy.node import Node
 from rclpy.time import Time as RclpyTime
 
 from gsfeatloc_ros.common.geometry import make_pose, matrix_from_quaternion, quaternion_from_matrix
+from gsfeatloc_ros.ros_io.transform_tree import MAX_WAIT, TransformError, unknown_transform
 
 # Seconds between two looks at what has come meanwhile.
 _POLL_PERIOD = 0.01
-
-
-class TransformError(ValueError):
-    """A transform that tf does not have, or no tf."""
 
 
 class Transforms:
@@ -44,7 +41,7 @@ class Transforms:
             self._buffer = tf2_ros.Buffer()
             self._listener = tf2_ros.TransformListener(self._buffer, self._node)
 
-    def lookup(self, target: str, source: str, stamp: int, timeout: float = 0.5) -> np.ndarray:
+    def lookup(self, target: str, source: str, stamp: int, timeout: float = MAX_WAIT) -> np.ndarray:
         """Return the pose T_target_source (4, 4) of the frame `source` in the frame `target`.
 
         What is not there yet is waited for, in seconds of the wall clock: the node's own may stand still. Not to be
@@ -70,11 +67,7 @@ class Transforms:
                 return _pose(found)
             except tf2_ros.TransformException as error:
                 if time.monotonic() >= deadline:
-                    when = f"at {stamp // 10**9}.{stamp % 10**9:09d}" if stamp else "at any time"
-                    raise TransformError(
-                        f"tf has no transform from {source!r} to {target!r} {when} ({error}): correct the names of the "
-                        "frames, or start what publishes it (ros2 run tf2_tools view_frames shows what there is)"
-                    ) from error
+                    raise unknown_transform(target, source, stamp, error) from error
             time.sleep(_POLL_PERIOD)
 
     def broadcast(self, parent: str, child: str, T_parent_child: np.ndarray, stamp: Time) -> None:

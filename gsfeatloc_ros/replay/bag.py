@@ -3,17 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
 from typing import Any
 
-from rosbags.highlevel import AnyReader
+from backports import zstd
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys.store import Typestore
+
+from gsfeatloc_ros.replay.bag_files import BagError, BagFile, in_words, open_files
 
 _POSES = ("geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
+_ODOMETRY = "nav_msgs/msg/Odometry"
+_TF = "tf2_msgs/msg/TFMessage"
+# How a message begins that was compressed by itself; those of ROS 2 begin with a zero.
+_ZSTD = b"\x28\xb5\x2f\xfd"
 
 
 class Role(Enum):
@@ -22,6 +29,10 @@ class Role(Enum):
     IMAGE = "image"
     CAMERA_INFO = "camera_info"
     PRIOR = "prior"
+    INITIAL_POSE = "initialpose"
+    ODOMETRY = "odom"
+    TF = "tf"
+    TF_STATIC = "tf_static"
     TRUTH = "truth"
 
 
@@ -29,13 +40,15 @@ class Role(Enum):
 _TYPES = {
     Role.IMAGE: ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"),
     Role.CAMERA_INFO: ("sensor_msgs/msg/CameraInfo",),
-    Role.PRIOR: _POSES,
-    Role.TRUTH: (*_POSES, "nav_msgs/msg/Odometry"),
+    Role.PRIOR: (*_POSES, _ODOMETRY),
+    Role.INITIAL_POSE: ("geometry_msgs/msg/PoseWithCovarianceStamped",),
+    Role.ODOMETRY: (_ODOMETRY,),
+    Role.TF: (_TF,),
+    Role.TF_STATIC: (_TF,),
+    Role.TRUTH: (*_POSES, _ODOMETRY),
 }
-
-
-class BagError(ValueError):
-    """A bag cannot be read, or lacks what is asked of it; the message names it and says what to do."""
+# Taken if they are there: a bag need not have them.
+_OPTIONAL = (Role.TF, Role.TF_STATIC)
 
 
 @dataclass(frozen=True)
@@ -63,15 +76,18 @@ class Bag:
         path: as it was opened.
         storage: how its messages are stored.
         images: number of its images.
+        start: time of its first message, in nanoseconds.
         seconds: from its first to its last message.
     """
 
     path: Path
     storage: StoragePlugin
     images: int
+    start: int
     seconds: float
-    _reader: AnyReader
+    _files: Sequence[BagFile]
     _roles: dict[str, list[Role]]
+    _types: Typestore
 
     def messages(self) -> Iterator[Recorded]:
         """Yield the messages of all roles in the order in which they were recorded.
@@ -79,77 +95,73 @@ class Bag:
         Raises:
             BagError: the bag is damaged from here on.
         """
-        wanted = [connection for connection in self._reader.connections if connection.topic in self._roles]
-        recorded = self._reader.messages(wanted)
-        while True:
-            try:
-                connection, bag_time, cdr = next(recorded)
-            except StopIteration:
-                return
-            except Exception as error:  # rosbags passes on whatever the decompressor, the database ... raise
-                raise BagError(f"{self.path}: is damaged, and ends here: {_words(error)}") from error
-            message, problem = None, ""
-            try:
-                message = self._reader.deserialize(cdr, connection.msgtype)
-            except Exception as error:  # the same
-                problem = f"the bytes of this message are no {connection.msgtype}: {_words(error)}"
-            for role in self._roles[connection.topic]:
-                yield Recorded(role, bag_time, message, problem)
+        for file in self._files:
+            recorded = file.messages(self._roles)
+            while True:
+                try:
+                    channel, bag_time, cdr = next(recorded)
+                except StopIteration:
+                    break
+                except Exception as error:  # the libraries pass on whatever the decompressor, the database ... raise
+                    raise BagError(f"{self.path}: is damaged, and ends here: {in_words(error)}") from error
+                message, problem = None, ""
+                try:
+                    cdr = zstd.decompress(cdr) if cdr.startswith(_ZSTD) else cdr
+                    message = self._types.deserialize_cdr(cdr, channel.type)
+                except Exception as error:  # the same
+                    problem = f"the bytes of this message are no {channel.type}: {in_words(error)}"
+                for role in self._roles[channel.topic]:
+                    yield Recorded(role, bag_time, message, problem)
 
 
 @contextmanager
-def open_bag(path: Path, topics: Mapping[Role, str]) -> Iterator[Bag]:
+def open_bag(path: Path, topics: Mapping[Role, Sequence[str]]) -> Iterator[Bag]:
     """Open a rosbag2 (a folder, or one .mcap or .db3 file) and check that it has what is needed.
+
+    What else is in it does not matter. Messages are read with the types of ROS 2 Jazzy.
 
     Args:
         path: of the bag.
-        topics: topic of each role that is wanted, the images' among them.
+        topics: those of each role that is wanted, one of the images among them; those of tf need not be there.
 
     Raises:
         BagError: the bag cannot be read, has no such topic, or messages of another type on it; or it has no images.
     """
     if not path.exists():
         raise BagError(f"{path}: there is no such bag")
-    if path.suffix == ".bag":
-        raise BagError(f"{path}: is a bag of ROS 1: convert it with rosbags-convert")
-    try:
-        reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY))
-        reader.open()
-    except Exception as error:  # rosbags passes on whatever the database, the YAML parser ... raise
-        raise BagError(
-            f"{path}: cannot be read: {_words(error)}; was its recording cut short? Try ros2 bag reindex"
-        ) from error
-    try:
+    with ExitStack() as stack:
+        files = open_files(path, stack)
         roles: dict[str, list[Role]] = {}
-        for role, topic in topics.items():
-            _check_topic(path, reader, role, topic)
-            roles.setdefault(topic, []).append(role)
-        images = sum(connection.msgcount for connection in reader.connections if connection.topic == topics[Role.IMAGE])
+        for role, names in topics.items():
+            for topic in names:
+                if _is_there(path, files, role, topic):
+                    roles.setdefault(topic, []).append(role)
+        images = sum(
+            count for file in files for channel, count in file.counts.items() if channel.topic in topics[Role.IMAGE]
+        )
         if not images:
-            raise BagError(f"{path}: has no message on {topics[Role.IMAGE]}")
-        yield Bag(path, _storage(path), images, 1e-9 * reader.duration, reader, roles)
-    finally:
-        reader.close()
+            raise BagError(f"{path}: has no message on {_either(topics[Role.IMAGE])}")
+        times = [time for file in files if file.times for time in file.times]
+        start, seconds = min(times), 1e-9 * (max(times) - min(times))
+        types = get_typestore(Stores.ROS2_JAZZY)
+        yield Bag(path, files[0].storage, images, start, seconds, files, roles, types)
 
 
-def _check_topic(path: Path, reader: AnyReader, role: Role, topic: str) -> None:
-    found = {connection.msgtype for connection in reader.connections if connection.topic == topic}
+def _is_there(path: Path, files: Sequence[BagFile], role: Role, topic: str) -> bool:
+    """Return whether a bag has a topic that can be used; raise BagError where it must and does not."""
+    channels = {channel for file in files for channel in file.counts}
+    found = {channel for channel in channels if channel.topic == topic}
+    if not found and role in _OPTIONAL:
+        return False
     if not found:
-        there = sorted({f"{connection.topic} ({connection.msgtype})" for connection in reader.connections})
+        there = sorted({f"{channel.topic} ({channel.type})" for channel in channels})
         raise BagError(f"{path}: has no topic {topic}; it has {', '.join(there) or 'none: it is empty'}")
-    if wrong := sorted(found.difference(_TYPES[role])):
+    if wrong := sorted({channel.type for channel in found} - set(_TYPES[role])):
         raise BagError(f"{path}: {topic} has {_either(wrong)}; {role.value} must be {_either(_TYPES[role])}")
-
-
-def _storage(path: Path) -> StoragePlugin:
-    files = path.iterdir() if path.is_dir() else [path]
-    return StoragePlugin.MCAP if any(".mcap" in file.suffixes for file in files) else StoragePlugin.SQLITE3
+    if wrong := sorted({channel.encoding for channel in found} - {"cdr"}):
+        raise BagError(f"{path}: {topic} is encoded as {_either(wrong)}: only ROS 2's own cdr is read")
+    return True
 
 
 def _either(kinds: Sequence[str]) -> str:
     return " or ".join(kinds)
-
-
-def _words(error: Exception) -> str:
-    """Return what an error says, in one line; some say nothing, then its type."""
-    return " ".join(str(error).split()).rstrip(".") or type(error).__name__

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from gsfeatloc_ros.evaluate.extras import import_extra
+from gsfeatloc_ros.localize.settings import MapSettings
 from gsfeatloc_ros.replay.output import errors
 from gsfeatloc_ros.replay.run import ReplayedImage
 from gsfeatloc_ros.replay.truth import Trajectory
@@ -17,7 +18,7 @@ from gsfeatloc_ros.replay.truth import Trajectory
 _ANSWER, _PRIOR, _NONE, _TRUTH = "#0072b2", "#e69f00", "#d55e00", "#8a94a0"
 
 
-def write_figure(path: Path, images: Sequence[ReplayedImage], truth: Trajectory, map_frame: str) -> None:
+def write_figure(path: Path, images: Sequence[ReplayedImage], truth: Trajectory, map_: MapSettings) -> None:
     """Draw the errors of answers and priors over time, and the trajectory from above, into a .png.
 
     Images without an answer are marked below the errors.
@@ -52,18 +53,34 @@ def write_figure(path: Path, images: Sequence[ReplayedImage], truth: Trajectory,
     rotation.tick_params(labelbottom=False)
     translation.set_xlabel("seconds since the first image")
     rotation.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
-    _draw_from_above(figure.add_subplot(grid[:, 1]), images, truth, map_frame)
+    _draw_from_above(figure.add_subplot(grid[:, 1]), images, truth, map_)
     figure.savefig(path, dpi=110)
 
 
-def _draw_from_above(axes: Any, images: Sequence[ReplayedImage], truth: Trajectory, map_frame: str) -> None:
-    positions = [image.pose.T_map_camera[:3, 3] for image in images if image.pose is not None]
-    x, y = np.reshape(positions, (-1, 3))[:, :2].T
-    axes.plot(*truth.positions[:, :2].T, color=_TRUTH, linewidth=1.5, label="truth")
-    axes.plot(x, y, ".", color=_ANSWER, label="answers")
+def up_axis(poses: np.ndarray) -> int:
+    """Return the axis of the map that points up, or down, for cameras that are held upright: 0, 1 or 2 for x, y, z.
+
+    Args:
+        poses: (N, 4, 4) T_map_camera of the cameras, whose y points down.
+    """
+    return int(np.argmax(np.abs(poses[:, :3, 1].sum(axis=0)))) if len(poses) else 2
+
+
+def _draw_from_above(axes: Any, images: Sequence[ReplayedImage], truth: Trajectory, map_: MapSettings) -> None:
+    answers = [image.T_map_camera for image in images if image.T_map_camera is not None]
+    poses = np.reshape(np.array([*truth.poses, *answers]), (-1, 4, 4))
+    # In the robot's map frame z is up; in that of a reconstruction it may be any.
+    up = 2 if map_.aligned else up_axis(poses)
+    is_down = not map_.aligned and poses[:, up, 1].sum() > 0
+    across, along = ((1, 2), (2, 0), (0, 1))[up]
+    known, found = np.split(poses[:, :3, 3], [len(truth)])
+    axes.plot(known[:, across], known[:, along], color=_TRUTH, linewidth=1.5, label="truth")
+    axes.plot(found[:, across], found[:, along], ".", color=_ANSWER, label="answers")
     axes.set_aspect("equal", adjustable="datalim")
     axes.set_title("Trajectory from above", loc="left")
-    axes.set_xlabel(f"x of {map_frame}, map units")
-    axes.set_ylabel("y")
+    axes.set_xlabel(f"{'xyz'[across]} of {map_.frame_id}, map units")
+    axes.set_ylabel("xyz"[along])
+    if is_down:
+        axes.invert_yaxis()
     axes.grid(color="#e4e8ec")
     axes.legend(frameon=False)

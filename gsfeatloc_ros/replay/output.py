@@ -18,6 +18,7 @@ from gsfeatloc_ros.replay.truth import Trajectory
 
 POSE_TOPIC = "/pose"
 
+_ABOUT = ("stamp", "bag_time", "status", "reason", "state", "prior")
 _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 _VARIANCES = ("var_x", "var_y", "var_z", "var_rx", "var_ry", "var_rz")
 _ERRORS = (
@@ -33,7 +34,8 @@ def errors(image: ReplayedImage, truth: Trajectory) -> dict[str, float]:
     true_pose = None if image.stamp is None else truth.at(image.stamp)
     if true_pose is None:
         return {}
-    poses = {"": None if image.pose is None else image.pose.T_map_camera, "prior_": image.T_map_camera_prior}
+    prior = None if image.query is None else image.query.T_map_camera_prior
+    poses = {"": image.T_map_camera, "prior_": prior}
     values = {}
     for prefix, pose in poses.items():
         if pose is not None:
@@ -47,13 +49,24 @@ def write_tum(path: Path, images: Sequence[ReplayedImage]) -> None:
     with path.open("w", encoding="utf-8") as file:
         for pose in (image.pose for image in images):
             if pose is not None:
-                numbers = " ".join(f"{value:.9f}" for value in _pose_values(pose.T_map_camera))
+                numbers = " ".join(f"{value:.9f}" for value in _pose_values(pose.T_map_body))
                 print(_seconds(pose.stamp), numbers, file=file)
 
 
 def write_csv(path: Path, images: Sequence[ReplayedImage], truth: Trajectory | None) -> None:
     """Write a line for each image; what is not known is empty. With `truth`, the errors too."""
-    names = ["stamp", "bag_time", "status", "reason", *Evidence().numbers(), "ms", *_POSE, *_VARIANCES]
+    names = [
+        "stamp",
+        "bag_time",
+        "status",
+        "reason",
+        "state",
+        "prior",
+        *Evidence().numbers(),
+        "ms",
+        *_POSE,
+        *_VARIANCES,
+    ]
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.DictWriter(file, names + (list(_ERRORS) if truth else []), lineterminator="\n")
         writer.writeheader()
@@ -84,13 +97,16 @@ def _row(image: ReplayedImage) -> dict[str, object]:
         "bag_time": _seconds(image.bag_time),
         "status": outcome.status.value,
         "reason": outcome.reason,
+        "state": image.state.value,
     }
+    if image.query is not None and image.query.source is not None:
+        row["prior"] = image.query.source.value
     if outcome.estimate is not None:
         numbers = outcome.estimate.evidence.numbers()
         row |= {name: "" if math.isnan(number) else number for name, number in numbers.items()}
         row["ms"] = f"{outcome.estimate.milliseconds['total']:.1f}"
     if pose is not None:
-        row |= zip(_POSE, _pose_values(pose.T_map_camera), strict=True)
+        row |= zip(_POSE, _pose_values(pose.T_map_body), strict=True)
         row |= zip(_VARIANCES, pose.covariance.diagonal().tolist(), strict=True)
     return row
 
@@ -102,7 +118,7 @@ def _pose_values(pose: np.ndarray) -> list[float]:
 
 def _pose_message(types: Mapping[str, type], pose: StampedPose, map_frame: str) -> object:
     seconds, rest = divmod(pose.stamp, 1_000_000_000)
-    values = _pose_values(pose.T_map_camera)
+    values = _pose_values(pose.T_map_body)
     stamp = types["builtin_interfaces/msg/Time"](sec=seconds, nanosec=rest)
     position = types["geometry_msgs/msg/Point"](*values[:3])
     orientation = types["geometry_msgs/msg/Quaternion"](*values[3:])

@@ -29,9 +29,9 @@ class Trajectory:
         return len(self._stamps)
 
     @property
-    def positions(self) -> np.ndarray:
-        """(N, 3), in the order of the stamps."""
-        return np.array([pose[:3, 3] for pose in self._poses]).reshape(-1, 3)
+    def poses(self) -> np.ndarray:
+        """(N, 4, 4), in the order of the stamps."""
+        return np.array(self._poses).reshape(-1, 4, 4)
 
     def at(self, stamp: int) -> np.ndarray | None:
         """Return the pose (4, 4) at a stamp in nanoseconds.

@@ -131,5 +131,20 @@ class Odometry(Protocol):
     pose: PoseWithCovariance
 
 
+class Transform(Protocol):
+    """geometry_msgs/Transform."""
+
+    translation: Point
+    rotation: Quaternion
+
+
+class TransformStamped(Protocol):
+    """geometry_msgs/TransformStamped."""
+
+    header: Header
+    child_frame_id: str
+    transform: Transform
+
+
 AnyImage = Image | CompressedImage
 AnyPose = PoseStamped | PoseWithCovarianceStamped

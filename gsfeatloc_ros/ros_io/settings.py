@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 from gsfeatloc_ros.common.parameter import Parameter, Value, parameter, parameters_of, settings_from
 from gsfeatloc_ros.index import IndexOptions
@@ -192,7 +194,25 @@ class Settings:
             planar=self.recovery.planar,
         )
 
+    @staticmethod
+    def checked(values: Mapping[str, Any]) -> Settings:
+        """Return the settings of values that people wrote; of parameters that are ROS's own there is no notice.
 
+        Raises:
+            ValueError: there is no such parameter, or it does not take such a value; the message says which.
+        """
+        known = {item.name: item for item in PARAMETERS}
+        converted = {}
+        for name, value in values.items():
+            if name in known:
+                converted[name] = known[name].converted(value)
+            elif not name.startswith(_OF_ROS):
+                near = difflib.get_close_matches(name, known, 1)
+                raise ValueError(f"there is no parameter {name}{f': is {near[0]} meant?' if near else ''}")
+        return Settings.of(converted)
+
+
+_OF_ROS = ("use_sim_time", "qos_overrides.", "start_type_description_service")
 _GROUPS = {
     "": NodeSettings,
     "map.": MapSettings,

@@ -6,8 +6,9 @@
 BAG is a rosbag2: its folder, or an .mcap or .db3 file. Into the folder of --out go answers.tum, answers.csv (a line for
 each image), the bag `answers` (geometry_msgs/PoseWithCovarianceStamped on /pose), and with --truth errors.png.
 
-An image is localized with the camera_info and the prior that were recorded last before it. The truth is compared at the
-stamp of the image, between two poses that are not more than 0.25 s apart.
+It is what the node does, by the same code: parameters are the node's (--params-file, -p), and so are tf, odometry,
+state and index. The truth is compared at the stamp of the image, between two poses that are not more than 0.25 s apart.
+The exit status is 3 where nothing was localized.
 """
 
 from __future__ import annotations
@@ -15,27 +16,30 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections import Counter
-from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from statistics import median
+from typing import Any
 
 from tqdm import tqdm
 
-from gsfeatloc_ros.common.parameter import settings_from
+from gsfeatloc_ros.common.parameter import values_of
 from gsfeatloc_ros.evaluate.extras import import_extra
-from gsfeatloc_ros.localize.engine import Engine, load_matcher, load_renderer
-from gsfeatloc_ros.localize.localizer import Localizer
+from gsfeatloc_ros.localize.engine import Engine, load_engine
+from gsfeatloc_ros.localize.map_index import index_for, index_key
 from gsfeatloc_ros.localize.options import LocalizerOptions
-from gsfeatloc_ros.localize.settings import MatcherSettings, RendererSettings
+from gsfeatloc_ros.localize.settings import MapSettings, MatcherSettings
 from gsfeatloc_ros.match import MATCHERS
-from gsfeatloc_ros.replay.bag import Bag, BagError, Role, open_bag
+from gsfeatloc_ros.replay.bag import Role, open_bag
+from gsfeatloc_ros.replay.bag_files import BagError
 from gsfeatloc_ros.replay.figure import write_figure
-from gsfeatloc_ros.replay.output import errors, write_bag, write_csv, write_tum
+from gsfeatloc_ros.replay.output import write_bag, write_csv, write_tum
 from gsfeatloc_ros.replay.run import Replay, ReplayedImage
+from gsfeatloc_ros.replay.summary import summary
 from gsfeatloc_ros.replay.truth import Trajectory
-from gsfeatloc_ros.ros_io.outcome import OutcomeStatus
+from gsfeatloc_ros.ros_io.calibration_file import read_calibration
+from gsfeatloc_ros.ros_io.parameter_file import parse_parameter, read_parameter_file
 from gsfeatloc_ros.ros_io.prior import PriorPolicy
+from gsfeatloc_ros.ros_io.settings import Settings
 from gsfeatloc_ros.tools.options import (
     CollectSettings,
     add_map_options,
@@ -46,15 +50,17 @@ from gsfeatloc_ros.tools.options import (
     setting,
 )
 
-# Reasons of a kind in the summary, of which there may be as many as images.
-_MAX_REASONS = 5
+# The exit status when no image was localized.
+NOTHING_LOCALIZED = 3
+# Parameters of the node that mean nothing in a replay.
+_WITHOUT_EFFECT = ("autostart", "image.transport", "image.timeout", "state.path", "transform_tolerance")
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; return the exit status.
 
-    It is 0 when all images were tried, 1 when something cannot be used and 130 when the user interrupted it. What came
-    before a damage of the bag or an interruption is written.
+    It is 0 when all images were tried, 3 when none of them was localized, 1 when something cannot be used and 130 when
+    the user interrupted it. What came before a damage of the bag or an interruption is written.
     """
     options = _parser().parse_args(arguments)
     try:
@@ -70,13 +76,12 @@ def main(arguments: list[str] | None = None) -> int:
 def _replay(options: argparse.Namespace) -> int:
     if options.out.exists() and (not options.out.is_dir() or any(options.out.iterdir())):
         raise ValueError(f"{options.out}: is there already: name a new or an empty folder")
-    topics = {Role.IMAGE: options.image, Role.CAMERA_INFO: options.camera_info, Role.PRIOR: options.prior}
     if options.truth:
-        topics[Role.TRUTH] = options.truth
         import_extra("matplotlib")  # to say now, not after an hour, that it is missing
-    policy = PriorPolicy(map_frame=options.map_frame, max_age=options.prior_max_age)
-    with open_bag(options.bag, topics) as bag:
-        replay = Replay(bag, _localizer(options), policy, options.rectified)
+    settings = _settings(options)
+    calibration = read_calibration(options.calibration) if options.calibration else None
+    with open_bag(options.bag, _topics(options, settings)) as bag:
+        replay = Replay(bag, _engine(settings), settings, calibration)
         options.out.mkdir(parents=True, exist_ok=True)
         start = time.monotonic()
         images, status = _collect(replay, bag.images)
@@ -84,11 +89,14 @@ def _replay(options: argparse.Namespace) -> int:
     truth = Trajectory(replay.truth) if options.truth else None
     write_tum(options.out / "answers.tum", images)
     write_csv(options.out / "answers.csv", images, truth)
-    write_bag(options.out / "answers", bag.storage, images, options.map_frame)
+    write_bag(options.out / "answers", bag.storage, images, settings.map.frame_id)
     if truth is not None:
-        write_figure(options.out / "errors.png", images, truth, options.map_frame)
-    print(_summary(bag, replay, images, truth, seconds))
+        write_figure(options.out / "errors.png", images, truth, settings.map)
+    print(summary(bag, replay, images, truth, seconds))
     print(f"wrote {options.out}")
+    if not status and not any(image.outcome.localized for image in images):
+        print("replay: nothing was localized", file=sys.stderr)
+        return NOTHING_LOCALIZED
     return status
 
 
@@ -111,52 +119,59 @@ def _collect(replay: Replay, count: int) -> tuple[list[ReplayedImage], int]:
     return images, 0
 
 
-def _localizer(options: argparse.Namespace) -> Localizer:
-    map_ = map_settings(options)
-    renderer = load_renderer(map_, RendererSettings())
-    print_reading("replay", renderer)
-    matcher = load_matcher(MatcherSettings(options.matcher, options.weights), renderer.device)
-    values = {"max_image_width": options.max_width, "seed": options.seed, **options.set}
-    return Engine(map_.path, renderer, matcher, settings_from(LocalizerOptions, values)).localizer
+def _settings(options: argparse.Namespace) -> Settings:
+    """Return the node's settings as the options have them: a parameter file, what -p sets, options of their own.
+
+    Raises:
+        ValueError: there is no such parameter, or it does not take such a value.
+    """
+    values = read_parameter_file(options.params_file) if options.params_file else {}
+    values |= dict(options.parameter)
+    map_, default = (
+        values_of(map_, "map.") for map_ in (replace(map_settings(options), path=str(options.map or "")), MapSettings())
+    )
+    values |= {name: value for name, value in map_.items() if value != default[name]}
+    own = {
+        "prior_max_age": options.prior_max_age,
+        "image.rectified": options.rectified or None,
+        "matcher.name": options.matcher,
+        "matcher.weights": options.weights,
+        "localizer.seed": options.seed,
+        "localizer.max_image_width": options.max_width,
+    }
+    values |= {name: value for name, value in own.items() if value is not None}
+    settings = Settings.checked(values | {f"localizer.{name}": value for name, value in options.set.items()})
+    for name in _WITHOUT_EFFECT:
+        if name in values:
+            print(f"replay: parameter {name} has no effect here", file=sys.stderr)
+    return settings
 
 
-def _summary(
-    bag: Bag, replay: Replay, images: Sequence[ReplayedImage], truth: Trajectory | None, seconds: float
-) -> str:
-    """Return what came out, for the terminal."""
-    outcomes = [image.outcome for image in images]
-    counts = Counter(outcome.status for outcome in outcomes)
-    localized = counts.pop(OutcomeStatus.LOCALIZED, 0)
-    lines = [f"localized {localized} of {len(images)} images"]
-    if len(images) < bag.images:
-        lines[0] += f"; the bag has {bag.images}"
-    elif bag.seconds:
-        lines[0] += f"; {bag.seconds:.1f} s of recording in {seconds:.1f} s"
-    times = [outcome.estimate.milliseconds["total"] for outcome in outcomes if outcome.estimate is not None]
-    if times:
-        lines.append(f"  median {median(times):.0f} ms an image")
-    for status in sorted(counts, key=lambda status: status.value):
-        lines.append(f"  {counts[status]} {status.value}:")
-        lines += _reasons(Counter(outcome.reason for outcome in outcomes if outcome.status is status))
-    for role in sorted({role for role, _ in replay.unusable}, key=lambda role: role.value):
-        lines.append(f"  {role.value} messages that cannot be used:")
-        lines += _reasons(Counter({why: count for (of, why), count in replay.unusable.items() if of is role}))
-    if truth is not None:
-        known = [errors(image, truth) for image in images if image.pose is not None]
-        pairs = [(e["rotation_error_deg"], e["translation_error"]) for e in known if e]
-        lines.append(f"  truth known for {len(pairs)} of the {localized} answers")
-        if pairs:
-            rotation, translation = zip(*pairs, strict=True)
-            lines[-1] += (
-                f": median error {median(rotation):.3f} degrees, {median(translation):.4f} map units; largest "
-                f"{max(rotation):.3f} degrees, {max(translation):.4f}"
-            )
-    return "\n".join(lines)
+def _topics(options: argparse.Namespace, settings: Settings) -> dict[Role, list[str]]:
+    """Return the topics of each role; raise ValueError where something needed has none, or one is of no use."""
+    if not options.camera_info and not options.calibration:
+        raise ValueError("name the topic of camera_info, or a file with the calibration: --camera-info, --calibration")
+    if options.odom and not settings.node.track:
+        raise ValueError("--odom: odometry is taken only with track, as by the node: add -p track:=true")
+    topics = {
+        Role.IMAGE: options.image,
+        Role.CAMERA_INFO: options.camera_info,
+        Role.PRIOR: options.prior,
+        Role.INITIAL_POSE: options.initialpose,
+        Role.ODOMETRY: options.odom,
+        Role.TF: options.tf,
+        Role.TF_STATIC: options.tf_static,
+        Role.TRUTH: options.truth,
+    }
+    return {role: names if isinstance(names, list) else [names] for role, names in topics.items() if names}
 
 
-def _reasons(counts: Counter[str]) -> list[str]:
-    lines = [f"    {count} x {reason}" for reason, count in counts.most_common(_MAX_REASONS)]
-    return lines + (["    ..."] if len(counts) > _MAX_REASONS else [])
+def _engine(settings: Settings) -> Engine:
+    """Load what localizes, and the index of the map's views."""
+    engine = load_engine(settings.map, settings.matcher, settings.renderer, settings.localizer)
+    print_reading("replay", engine.renderer)
+    key = index_key(engine.map_path, settings.map, settings.matcher)
+    return engine.with_index(index_for(engine, settings.index, key))
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -165,13 +180,32 @@ def _parser() -> argparse.ArgumentParser:
     )
     matcher, localizer = MatcherSettings(), LocalizerOptions()
     parser.add_argument("bag", type=Path, help="folder of a rosbag2, or an .mcap or .db3 file")
-    parser.add_argument("--map", type=Path, required=True, help="the Gaussian Splatting map")
-    for option, types in (
-        ("--image", "sensor_msgs/Image or CompressedImage"),
-        ("--camera-info", "sensor_msgs/CameraInfo"),
-        ("--prior", "geometry_msgs/PoseStamped or PoseWithCovarianceStamped"),
-    ):
-        parser.add_argument(option, metavar="TOPIC", required=True, help=types)
+    parser.add_argument("--map", type=Path, help="the Gaussian Splatting map, as map.path")
+    parser.add_argument("--image", metavar="TOPIC", required=True, help="sensor_msgs/Image or CompressedImage")
+    parser.add_argument("--camera-info", metavar="TOPIC", help="sensor_msgs/CameraInfo")
+    parser.add_argument(
+        "--calibration", type=Path, metavar="FILE", help="of a bag without camera_info, as camera_calibration writes it"
+    )
+    parser.add_argument(
+        "--prior",
+        metavar="TOPIC",
+        action="append",
+        help="PoseStamped, PoseWithCovarianceStamped or Odometry; may be given several times",
+    )
+    parser.add_argument("--initialpose", metavar="TOPIC", help="geometry_msgs/PoseWithCovarianceStamped, of the base")
+    parser.add_argument("--odom", metavar="TOPIC", help="nav_msgs/Odometry, with -p track:=true")
+    parser.add_argument("--tf", metavar="TOPIC", default="/tf", help="if it is there (default: %(default)s)")
+    parser.add_argument("--tf-static", metavar="TOPIC", default="/tf_static", help="the same (default: %(default)s)")
+    parser.add_argument("--params-file", type=Path, metavar="FILE", help="parameters of the node")
+    parser.add_argument(
+        "-p",
+        dest="parameter",
+        type=_parameter,
+        action="append",
+        default=[],
+        metavar="NAME:=VALUE",
+        help="one of these; what is set by an option of its own comes last",
+    )
     parser.add_argument(
         "--truth",
         metavar="TOPIC",
@@ -180,21 +214,19 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--prior-max-age",
         type=number(float, 0),
-        default=PriorPolicy().max_age,
         metavar="SECONDS",
         help="for which a prior holds as it is; it may be newer than an image by no more; 0 for no limit (default: "
-        "%(default)s)",
+        f"{PriorPolicy().max_age:g})",
     )
     parser.add_argument("--rectified", action="store_true", help="the images are rectified, as image.rectified")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new or empty folder")
-    parser.add_argument("--matcher", choices=sorted(MATCHERS), default=matcher.name, help="default: %(default)s")
-    parser.add_argument("--weights", default="", metavar="PATH", help="of a learned matcher, as matcher.weights")
-    parser.add_argument("--seed", type=number(int, 0), default=localizer.seed, help="of RANSAC and of the search")
+    parser.add_argument("--matcher", choices=sorted(MATCHERS), help=f"default: {matcher.name}")
+    parser.add_argument("--weights", metavar="PATH", help="of a learned matcher, as matcher.weights")
+    parser.add_argument("--seed", type=number(int, 0), help="of RANSAC and of the search")
     parser.add_argument(
         "--max-width",
         type=number(int, 1),
-        default=localizer.max_image_width,
-        help="resize wider images (default: %(default)s)",
+        help=f"resize wider images (default: {localizer.max_image_width})",
     )
     parser.add_argument(
         "--set",
@@ -206,6 +238,14 @@ def _parser() -> argparse.ArgumentParser:
     )
     add_map_options(parser)
     return parser
+
+
+def _parameter(text: str) -> tuple[str, Any]:
+    """Parse NAME:=VALUE."""
+    try:
+        return parse_parameter(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
 
 
 if __name__ == "__main__":

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from rosbags.rosbag2 import StoragePlugin, Writer
 
+from gsfeatloc_ros.common.geometry import quaternion_from_matrix
 from gsfeatloc_ros.simulate import bag_messages
 from gsfeatloc_ros.simulate.bag import CAMERA_INFO_TOPIC, IMAGE_TOPIC, PRIOR_TOPIC, TRUTH_TOPIC
 from gsfeatloc_ros.simulate.bag_messages import CAMERA_FRAME, STORE, header, make, pose, pose_stamped
@@ -40,18 +41,34 @@ def pose_with_covariance(stamp: float, T_map_camera: np.ndarray, covariance: np.
     return make("geometry_msgs/msg/PoseWithCovarianceStamped", header=header(stamp, "map"), pose=content)
 
 
-def odometry(stamp: float, T_map_camera: np.ndarray) -> Any:
-    """Return an Odometry of the camera in the frame of the map."""
+def odometry(stamp: float, T_frame_body: np.ndarray, frame: str = "map", body: str = "camera") -> Any:
+    """Return an Odometry of a body in a frame; of the camera in that of the map."""
     zero = make("geometry_msgs/msg/Vector3", 0.0, 0.0, 0.0)
     twist = make(
         "geometry_msgs/msg/TwistWithCovariance",
         twist=make("geometry_msgs/msg/Twist", linear=zero, angular=zero),
         covariance=np.zeros(36),
     )
-    content = _with_covariance(T_map_camera, np.zeros((6, 6)))
-    return make(
-        "nav_msgs/msg/Odometry", header=header(stamp, "map"), child_frame_id="camera", pose=content, twist=twist
+    content = _with_covariance(T_frame_body, np.zeros((6, 6)))
+    return make("nav_msgs/msg/Odometry", header=header(stamp, frame), child_frame_id=body, pose=content, twist=twist)
+
+
+def transform(stamp: float, parent: str, child: str, T_parent_child: np.ndarray) -> Any:
+    """Return a TransformStamped of the pose (4, 4) of a frame in its parent."""
+    rotation = make("geometry_msgs/msg/Quaternion", *quaternion_from_matrix(T_parent_child[:3, :3]).tolist())
+    moved = make(
+        "geometry_msgs/msg/Transform",
+        translation=make("geometry_msgs/msg/Vector3", *T_parent_child[:3, 3].tolist()),
+        rotation=rotation,
     )
+    return make(
+        "geometry_msgs/msg/TransformStamped", header=header(stamp, parent), child_frame_id=child, transform=moved
+    )
+
+
+def transforms(*stamped: Any) -> Any:
+    """Return the message of /tf, or of /tf_static, with these transforms."""
+    return make("tf2_msgs/msg/TFMessage", transforms=list(stamped))
 
 
 def compressed_image(stamp: float, rgb: np.ndarray, suffix: str, form: str) -> Any:
@@ -61,9 +78,13 @@ def compressed_image(stamp: float, rgb: np.ndarray, suffix: str, form: str) -> A
 
 
 def write_messages(
-    path: Path, messages: list, storage: StoragePlugin = StoragePlugin.MCAP, topics: dict | None = None
+    path: Path,
+    messages: list,
+    storage: StoragePlugin = StoragePlugin.MCAP,
+    topics: dict | None = None,
+    step: float = 0.001,
 ) -> Path:
-    """A bag of (topic, message) or (topic, (type, bytes)), recorded a millisecond apart."""
+    """A bag of (topic, message) or (topic, (type, bytes)), recorded so many seconds apart from one second on."""
     with Writer(path, version=9, storage_plugin=storage) as writer:
         connections = {}
         for topic, name in (topics or {}).items():
@@ -73,7 +94,7 @@ def write_messages(
             if topic not in connections:
                 connections[topic] = writer.add_connection(topic, name, typestore=STORE)
             cdr = STORE.serialize_cdr(message, name) if cdr is None else cdr
-            writer.write(connections[topic], 10**9 + 10**6 * number, cdr)
+            writer.write(connections[topic], 10**9 + round(1e9 * step * number), cdr)
     return path
 
 
@@ -89,8 +110,8 @@ def recording(photo, camera, *, stamp: float | None = None) -> list:
 
 
 def replay_arguments(bag: Path, map_file: Path, out: Path, *more: str, truth: bool = True) -> list[str]:
-    """Return the command line of replay for a bag of these topics."""
-    options = [str(bag), "--map", str(map_file), "--out", str(out)]
+    """Return the command line of replay for a bag of these topics; an index of the map is not made for it."""
+    options = [str(bag), "--map", str(map_file), "--out", str(out), "-p", "index.build:=false"]
     for role, topic in TOPICS.items():
         options += [f"--{role.replace('_', '-')}", topic]
     return [*options, *(["--truth", TRUTH] if truth else []), *more]

@@ -31,6 +31,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin
 
 from gsfeatloc_ros.common.geometry import make_pose, so3_exp
+from gsfeatloc_ros.localize.engine import Engine
 from gsfeatloc_ros.localize.localizer import Localizer
 from gsfeatloc_ros.localize.options import LocalizerOptions
 from gsfeatloc_ros.maps import load_map
@@ -41,10 +42,10 @@ from gsfeatloc_ros.replay.run import Replay
 from gsfeatloc_ros.replay.truth import MAX_GAP, Trajectory
 from gsfeatloc_ros.ros_io.decode import decode_compressed_image, decode_covariance
 from gsfeatloc_ros.ros_io.outcome import OutcomeStatus
-from gsfeatloc_ros.ros_io.prior import PriorPolicy
+from gsfeatloc_ros.ros_io.settings import Settings
 from gsfeatloc_ros.simulate import write_bag
 from gsfeatloc_ros.simulate.bag_messages import header, make
-from gsfeatloc_ros.tools.replay import main
+from gsfeatloc_ros.tools.replay import NOTHING_LOCALIZED, main
 
 storages = pytest.mark.parametrize(
     "storage",
@@ -152,7 +153,7 @@ def test_other_types_of_messages(room_camera, room_photos, room_map_file, tmp_pa
 def test_the_command_needs_no_ros(room_camera, room_photos, room_map_file, tmp_path):
     write_bag(tmp_path / "bag", room_camera, room_photos[:1])
     hide = "import sys; sys.modules.update(dict.fromkeys(['rclpy', 'sensor_msgs', 'geometry_msgs']));"
-    code = f"{hide} from gsfeatloc_ros.tools.replay import main; sys.exit(main(sys.argv[1:]))"
+    code = f"{hide} from gsfeatloc_ros.tools.replay import NOTHING_LOCALIZED, main; sys.exit(main(sys.argv[1:]))"
     command = [sys.executable, "-c", code, *replay_arguments(tmp_path / "bag", room_map_file, tmp_path / "out")]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
@@ -182,7 +183,7 @@ def event_message(event: str, number: int, camera) -> tuple:
 
 @unhurried
 @given(st.lists(st.sampled_from(EVENTS), max_size=9), st.sampled_from([StoragePlugin.MCAP, StoragePlugin.SQLITE3]))
-def test_images_are_paired_with_the_newest(localizer, small_camera, tmp_path_factory, events, storage):
+def test_images_are_paired_with_the_newest(engine, small_camera, tmp_path_factory, events, storage):
     events = [*events, "image"]
     messages = [event_message(event, number, small_camera) for number, event in enumerate(events)]
     kinds = {
@@ -191,8 +192,8 @@ def test_images_are_paired_with_the_newest(localizer, small_camera, tmp_path_fac
         TOPICS["prior"]: "geometry_msgs/msg/PoseStamped",
     }
     bag = write_messages(tmp_path_factory.mktemp("bag") / "bag", messages, storage, kinds)
-    with open_bag(bag, {Role(role): topic for role, topic in TOPICS.items()}) as opened:
-        replay = Replay(opened, localizer, PriorPolicy())
+    with open_bag(bag, {Role(role): [topic] for role, topic in TOPICS.items()}) as opened:
+        replay = Replay(opened, engine, Settings())
         replayed = iter(list(replay.images()))
     # A prior that cannot be used is worse than none: without one, the image may be anywhere.
     info, prior = None, "none"
@@ -210,9 +211,9 @@ def test_images_are_paired_with_the_newest(localizer, small_camera, tmp_path_fac
                 assert image.outcome.status is OutcomeStatus.FAILED
                 assert image.outcome.reason
                 if prior == "none":
-                    assert image.T_map_camera_prior is None
+                    assert image.query.T_map_camera_prior is None
                 else:
-                    assert image.T_map_camera_prior[0, 3] == prior
+                    assert image.query.T_map_camera_prior[0, 3] == prior
             else:
                 assert image.outcome.status is OutcomeStatus.REFUSED
                 assert image.outcome.reason
@@ -227,8 +228,8 @@ def small_camera(room_camera):
 
 
 @pytest.fixture(scope="session")
-def localizer(room_map):
-    return Localizer(create_renderer(room_map), create_matcher("sift"))
+def engine(room_map):
+    return Engine("", create_renderer(room_map), create_matcher("sift"), LocalizerOptions())
 
 
 def test_images_that_cannot_be_used_are_lines(room_camera, room_photos, room_map_file, tmp_path, capsys):
@@ -278,7 +279,7 @@ def test_an_exception_is_a_line_and_an_interruption_keeps_what_came_before(
         assert len(list(reader.messages())) == 1
 
 
-def test_no_answer_at_all(room_camera, room_map_file, tmp_path):
+def test_no_answer_at_all(room_camera, room_map_file, tmp_path, capsys):
     bag = write_messages(
         tmp_path / "bag",
         [event_message("image", 0, room_camera)],
@@ -288,7 +289,10 @@ def test_no_answer_at_all(room_camera, room_map_file, tmp_path):
             TRUTH: "geometry_msgs/msg/PoseStamped",
         },
     )
-    assert main(replay_arguments(bag, room_map_file, tmp_path / "out")) == 0
+    assert main(replay_arguments(bag, room_map_file, tmp_path / "out")) == NOTHING_LOCALIZED
+    said = capsys.readouterr()
+    assert "localized NONE of 1 images" in said.out
+    assert "replay: nothing was localized" in said.err
     assert (tmp_path / "out" / "answers.tum").read_text() == ""
     assert [row["status"] for row in rows_of(tmp_path / "out")] == ["refused"]
     assert (tmp_path / "out" / "errors.png").exists()
@@ -311,7 +315,7 @@ def refused(capsys, arguments: list[str]) -> str:
         ("--truth", "/camera/image_raw", "truth must be geometry_msgs/msg/PoseStamped or geometry_msgs/msg/PoseWith"),
         ("--map", "/no.ply", "/no.ply: cannot be read"),
         ("--map-rotation", "0 0 0 0", "has no direction"),
-        ("--map-scale", "-1", "scale -1.0 is not a positive number"),
+        ("--map-scale", "-1", "parameter map.scale: -1.0 is not within 1e-06 and 1e+06"),
     ],
 )
 def test_options_that_cannot_be_used(room_camera, room_photos, room_map_file, tmp_path, capsys, option, topic, says):
@@ -328,11 +332,11 @@ def test_bags_that_cannot_be_used(storage, room_camera, room_photos, room_map_fi
 
     assert "no: there is no such bag" in says(tmp_path / "no")
     (tmp_path / "folder").mkdir()
-    assert "folder: cannot be read" in says(tmp_path / "folder")
-    (tmp_path / "folder" / "metadata.yaml").write_text("{\n")
-    assert "folder: cannot be read" in says(tmp_path / "folder")
-    (tmp_path / "notes.txt").write_text("not a bag")
-    assert "notes.txt: cannot be read" in says(tmp_path / "notes.txt")
+    assert "folder: is no rosbag2: this folder has no .mcap or .db3 file" in says(tmp_path / "folder")
+    (tmp_path / "notes.txt").write_text("not a bag, but long enough to be none of the two")
+    assert "notes.txt: is no file of a rosbag2: neither MCAP nor SQLite" in says(tmp_path / "notes.txt")
+    (tmp_path / "old.bag").write_text("#ROSBAG V2.0\n")
+    assert "old.bag: is a bag of ROS 1" in says(tmp_path / "old.bag")
     assert "has no topic /camera/image_raw; it has none: it is empty" in says(
         write_messages(tmp_path / "bare", [], storage)
     )
@@ -347,7 +351,10 @@ def test_bags_that_cannot_be_used(storage, room_camera, room_photos, room_map_fi
     whole = file.read_bytes()
     for size in (0, 5, len(whole) // 2):
         file.write_bytes(whole[:size])
-        assert "bag: cannot be read" in says(tmp_path / "bag")
+        assert f"{file.name}: was cut short while it was recorded or copied: try ros2 bag reindex" in says(file)
+    # What is damaged otherwise was not cut short.
+    file.write_bytes(whole[:16] + bytes(len(whole) - 24) + whole[-8:])
+    assert "cut short" not in says(file)
     assert not (tmp_path / "out").exists()
 
 
@@ -397,7 +404,7 @@ def test_truth_turns_and_moves_evenly_between_two_poses(start, share, angle, gap
 
 def test_truth_that_is_not_known():
     assert Trajectory([]).at(0) is None
-    assert Trajectory([]).positions.shape == (0, 3)
+    assert Trajectory([]).poses.shape == (0, 4, 4)
     one = Trajectory([(5, np.eye(4))])
     assert one.at(4) is None
     assert one.at(6) is None
