@@ -219,7 +219,7 @@ def test_in_the_suite_the_photos_of_each_scene_are_looked_for_in_all_others():
     runs = Combinations(scenes, conditions, None, ["default"], ["sift"], [1.0], [0, 1], 640, {}).runs()
     assert len(runs) == len(set(runs)) == 2 * (3 * (len(conditions) - 1) + 6)
     others = {(run.scene.name, Path(run.negative).name) for run in runs if run.negative not in ("", *NEGATIVES)}
-    assert others == {(a.name, b.name) for a, _ in scenes for b, _ in scenes if a != b}
+    assert others == {(a.name, b.name) for a, _, _ in scenes for b, _, _ in scenes if a != b}
     # A map is not degraded, or read, more often than needed.
     maps = [(run.scene, run.degradation) for run in runs]
     assert len(set(maps)) == sum(a != b for a, b in itertools.pairwise(maps)) + 1
