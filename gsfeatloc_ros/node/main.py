@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable
 from types import FrameType
 
-from gsfeatloc_ros.common.openmp import wait_passively
+from gsfeatloc_ros.common.threads import wait_passively
 
 # Seconds that the running localization gets to end after a signal, and requests in progress to be answered.
 _STOP_TIMEOUT = 3.0
@@ -34,10 +34,11 @@ def main(args: list[str] | None = None) -> int:
     from rclpy.signals import SignalHandlerOptions
 
     from gsfeatloc_ros.node.localizer_node import LocalizerNode
+    from gsfeatloc_ros.node.parameters import with_lists_of_doubles
 
     # rclpy's own handlers shut the context down at once; the running localization and requests are to end first.
     try:
-        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+        rclpy.init(args=with_lists_of_doubles(args or sys.argv), signal_handler_options=SignalHandlerOptions.NO)
         node = LocalizerNode()
     except (ValueError, ParameterException) as error:
         rclpy.logging.get_logger("localizer").fatal(str(error))
