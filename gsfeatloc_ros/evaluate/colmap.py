@@ -2,7 +2,7 @@
 
 COLMAP's poses map the world into the camera, with OpenCV's axes, and its pixels have the centre of the top-left one at
 (0.5, 0.5); both are turned into this package's conventions here. As 3DGS and Mip-NeRF360 do, every eighth photo by
-name is for testing and the others have made the map.
+name is for testing and the others have made the map. Photos may be smaller than the model's cameras say.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.geometry import invert, make_pose
 from gsfeatloc_ros.evaluate.colmap_files import copy_without_points
-from gsfeatloc_ros.evaluate.dataset import PosedPhoto
+from gsfeatloc_ros.evaluate.dataset import PosedPhoto, scaled_to_photo
 from gsfeatloc_ros.evaluate.extras import import_extra
 
 _TEST_EVERY = 8
@@ -30,6 +30,9 @@ _MODELS: dict[str, tuple[tuple[int, int, int, int], str, tuple[int | None, ...]]
     "SIMPLE_RADIAL": ((0, 0, 1, 2), "plumb_bob", (3, None, None, None)),
     "RADIAL": ((0, 0, 1, 2), "plumb_bob", (3, 4, None, None)),
     "OPENCV": ((0, 1, 2, 3), "plumb_bob", (4, 5, 6, 7)),
+    "FULL_OPENCV": ((0, 1, 2, 3), "rational_polynomial", (4, 5, 6, 7, 8, 9, 10, 11)),
+    "SIMPLE_RADIAL_FISHEYE": ((0, 0, 1, 2), "equidistant", (3, None, None, None)),
+    "RADIAL_FISHEYE": ((0, 0, 1, 2), "equidistant", (3, 4, None, None)),
     "OPENCV_FISHEYE": ((0, 1, 2, 3), "equidistant", (4, 5, 6, 7)),
 }
 
@@ -58,7 +61,8 @@ def load(folder: Path) -> tuple[list[PosedPhoto], np.ndarray]:
         if image.camera.camera_id not in cameras:
             cameras[image.camera.camera_id] = _camera(path, image.camera)
         file = folder / "images" / image.name
-        photos.append(PosedPhoto(file.name, file, cameras[image.camera.camera_id], image.T_map_camera))
+        camera = scaled_to_photo(cameras[image.camera.camera_id], file)
+        photos.append(PosedPhoto(file.name, file, camera, image.T_map_camera))
     return photos, np.array([image.T_map_camera for image in images])
 
 

@@ -91,6 +91,10 @@ class Reporter:
         self._node.get_logger().warning(reason)
         return True
 
+    def say(self, reason: str) -> None:
+        """Log a warning, of what is said once."""
+        self._node.get_logger().warning(reason)
+
     def info(self, reason: str) -> None:
         """Log what is worth knowing."""
         self._node.get_logger().info(reason)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -21,6 +22,8 @@ LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 LAST = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 # All of it counts, and much may come while a map is loaded.
 ODOMETRY = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
+# Messages of a topic between the two times that one comes.
+_MAX_TWICE = 100
 
 
 def overridable() -> QoSOverridingOptions:
@@ -38,15 +41,51 @@ class Topic:
         message_type: of what comes on it.
         name: before remapping.
         qos: that is asked for.
+        latched: whether what was said before this node listened still holds, if its publisher keeps it.
+        needed: whether nothing is localized without it.
     """
 
     message_type: type
     name: str
     qos: QoSProfile
+    latched: bool = False
+    needed: bool = False
 
 
-def subscribe(node: Node, topic: Topic, callback: Callable[[Any], None], refuse: Callable[[str], None]) -> Subscription:
-    """Subscribe with a QoS that can be overridden; `refuse` gets the reason why that of a publisher does not fit."""
+@dataclass(frozen=True, eq=False)
+class Listener:
+    """A topic that is listened to.
+
+    Attributes:
+        topic: as it is asked for.
+        subscriptions: the first is what every publisher should fit.
+    """
+
+    topic: Topic
+    subscriptions: tuple[Subscription, ...]
+
+    @property
+    def name(self) -> str:
+        """Of the topic, after remapping."""
+        return self.subscriptions[0].topic_name
+
+    @property
+    def type_name(self) -> str:
+        """Of the messages, as the graph has it."""
+        message_type = self.topic.message_type
+        return f"{message_type.__module__.split('.')[0]}/msg/{message_type.__name__}"
+
+    @property
+    def qos(self) -> QoSProfile:
+        """That is asked for, overridden or not."""
+        return self.subscriptions[0].qos_profile
+
+
+def subscribe(node: Node, topic: Topic, callback: Callable[[Any], None], refuse: Callable[[str], None]) -> Listener:
+    """Subscribe with a QoS that can be overridden; `refuse` gets the reason why that of a publisher does not fit.
+
+    Where the topic is `latched`, what was said before is heard too.
+    """
     name = node.resolve_topic_name(topic.name)
 
     def incompatible(event: Any) -> None:
@@ -56,11 +95,31 @@ def subscribe(node: Node, topic: Topic, callback: Callable[[Any], None], refuse:
             f"qos_overrides.{name}.subscription.{policy} to what it offers (ros2 topic info --verbose {name})"
         )
 
-    return node.create_subscription(
+    taken: Callable[..., None] = _once(callback) if topic.latched else callback
+    first = node.create_subscription(
         topic.message_type,
         topic.name,
-        callback,
+        taken,
         topic.qos,
         event_callbacks=SubscriptionEventCallbacks(incompatible_qos=incompatible),
         qos_overriding_options=overridable(),
     )
+    if not topic.latched:
+        return Listener(topic, (first,))
+    # DDS gives what was said before to those alone who ask for it, and to these nothing of who does not keep it.
+    silent = SubscriptionEventCallbacks(incompatible_qos=lambda event: None)
+    second = node.create_subscription(topic.message_type, topic.name, taken, LAST, event_callbacks=silent)
+    return Listener(topic, (first, second))
+
+
+def _once(callback: Callable[[Any], None]) -> Callable[[Any, Any], None]:
+    """Return a callback of two subscriptions to the same topic, to which a message may come twice."""
+    seen: deque[int] = deque(maxlen=_MAX_TWICE)
+
+    def take(message: Any, info: Any) -> None:
+        stamp = info["source_timestamp"]
+        if stamp not in seen:
+            seen.append(stamp)
+            callback(message)
+
+    return take
