@@ -45,10 +45,14 @@ class GraphWatch:
     def look(self, unheard: Sequence[Listener], mode: str) -> str:
         """Return why nothing came on topics, and log it when it changes; empty where there is nothing to say.
 
+        What was said on them before is asked for, where its publisher keeps it.
+
         Args:
             unheard: the topics on which nothing came yet.
             mode: of the node.
         """
+        for listener in unheard:
+            listener.hear_latched(self._node)
         problems = [self._problem(listener) for listener in unheard]
         if mode != ON_REQUEST:
             problems += [self._silence(listener) for listener in unheard if listener.topic.needed]
@@ -82,11 +86,11 @@ class GraphWatch:
         """Return what to do where nobody publishes a topic, or one who does sends nothing; empty for other problems."""
         if self._problem(listener):
             return ""
-        if self._node.count_publishers(listener.name):
+        if self._is_published(listener.name):
             return f"{listener.name} has a publisher, but nothing came from it: is it running?"
         text = f"nobody publishes {listener.name} ({listener.type_name})"
         known = self._node.get_topic_names_and_types()
-        there = {name: types for name, types in known if self._node.count_publishers(name)}
+        there = {name: types for name, types in known if self._is_published(name)}
         others = [name for name, types in there.items() if listener.type_name in types]
         raw, compressed = listener.name.removesuffix(_COMPRESSED), f"{listener.name}{_COMPRESSED}"
         if _COMPRESSED_IMAGE in there.get(compressed, ()):
@@ -96,6 +100,11 @@ class GraphWatch:
         if others:
             return f"{text}; of this type are {', '.join(others)}: remap {listener.topic.name} to the right one"
         return f"{text}: start what does, or remap {listener.topic.name}"
+
+    def _is_published(self, name: str) -> bool:
+        """Return whether anybody else publishes a topic."""
+        publishers = self._node.get_publishers_info_by_topic(name)
+        return any(publisher.node_name != self._node.get_name() for publisher in publishers)
 
 
 def _advice(listener: Listener, found: str) -> str:

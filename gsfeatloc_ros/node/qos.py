@@ -52,17 +52,19 @@ class Topic:
     needed: bool = False
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Listener:
     """A topic that is listened to.
 
     Attributes:
         topic: as it is asked for.
+        callback: that takes what comes.
         subscriptions: the first is what every publisher should fit.
     """
 
     topic: Topic
-    subscriptions: tuple[Subscription, ...]
+    callback: Callable[..., None]
+    subscriptions: list[Subscription]
 
     @property
     def name(self) -> str:
@@ -80,12 +82,23 @@ class Listener:
         """That is asked for, overridden or not."""
         return self.subscriptions[0].qos_profile
 
+    def hear_latched(self, node: Node) -> None:
+        """Hear what a publisher said before, if it keeps that and it still holds.
+
+        DDS gives that to those alone who ask for it, and to these nothing of who does not keep it, with a warning in
+        its log: who only might be there is not asked.
+        """
+        if not self.topic.latched or len(self.subscriptions) > 1:
+            return
+        publishers = node.get_publishers_info_by_topic(self.name)
+        kept = [p for p in publishers if p.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL]
+        if any(publisher.topic_type == self.type_name for publisher in kept):
+            message_type, name = self.topic.message_type, self.topic.name
+            self.subscriptions.append(node.create_subscription(message_type, name, self.callback, LAST))
+
 
 def subscribe(node: Node, topic: Topic, callback: Callable[[Any], None], refuse: Callable[[str], None]) -> Listener:
-    """Subscribe with a QoS that can be overridden; `refuse` gets the reason why that of a publisher does not fit.
-
-    Where the topic is `latched`, what was said before is heard too.
-    """
+    """Subscribe with a QoS that can be overridden; `refuse` gets the reason why that of a publisher does not fit."""
     name = node.resolve_topic_name(topic.name)
 
     def incompatible(event: Any) -> None:
@@ -104,12 +117,7 @@ def subscribe(node: Node, topic: Topic, callback: Callable[[Any], None], refuse:
         event_callbacks=SubscriptionEventCallbacks(incompatible_qos=incompatible),
         qos_overriding_options=overridable(),
     )
-    if not topic.latched:
-        return Listener(topic, (first,))
-    # DDS gives what was said before to those alone who ask for it, and to these nothing of who does not keep it.
-    silent = SubscriptionEventCallbacks(incompatible_qos=lambda event: None)
-    second = node.create_subscription(topic.message_type, topic.name, taken, LAST, event_callbacks=silent)
-    return Listener(topic, (first, second))
+    return Listener(topic, taken, [first])
 
 
 def _once(callback: Callable[[Any], None]) -> Callable[[Any, Any], None]:

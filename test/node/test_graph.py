@@ -163,8 +163,8 @@ def test_it_is_logged_once_and_when_it_changes(found, monkeypatch):
 def test_what_was_said_before_is_heard_once(found):
     publisher = found.robot.create_publisher(CameraInfo, "camera_info", LAST)
     publisher.publish(CameraInfo(width=1))
-    found.listen(INFO)
-    assert found.spin_until(lambda: len(found.heard) == 1)
+    listener = found.listen(INFO)
+    assert found.spin_until(lambda: (found.watch.look([listener], CONTINUOUS), len(found.heard) == 1)[1])
     publisher.publish(CameraInfo(width=2))
     assert found.spin_until(lambda: len(found.heard) == 2)
     found.spin_until(lambda: len(found.heard) > 2, seconds=0.5)
