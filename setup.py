@@ -44,6 +44,7 @@ setup(
         "pyyaml>=6,<7",
         "rosbags>=0.11,<0.12",
         "scipy>=1.11,<2",
+        "threadpoolctl>=3.1,<4",  # limits the threads of BLAS, which numpy has loaded
         "torch>=2.5.1,<3",
         "tqdm>=4.60,<5",
     ],

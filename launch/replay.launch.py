@@ -15,7 +15,6 @@ from launch.actions import (
 from launch.event_handlers import OnProcessIO
 from launch.events.process import ProcessIO
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
-from launch_ros.actions import SetParameter
 from launch_ros.substitutions import FindPackageShare
 
 from launch import LaunchDescription
@@ -38,15 +37,15 @@ def generate_launch_description() -> LaunchDescription:
         started = True
         return [play]
 
+    arguments = {"map": LaunchConfiguration("map"), "use_sim_time": "true"}
     localizer = PathJoinSubstitution([FindPackageShare("gsfeatloc_ros"), "launch", "localizer.launch.py"])
     return LaunchDescription(
         [
             DeclareLaunchArgument("bag", description="Path of the rosbag2"),
             DeclareLaunchArgument("map", description="Path of the 3D Gaussian Splatting map"),
             DeclareLaunchArgument("rate", default_value="1.0", description="Times the speed of the recording"),
-            SetParameter("use_sim_time", True),
             RegisterEventHandler(OnProcessIO(on_stdout=start_when_ready, on_stderr=start_when_ready)),
             # Its other arguments, such as the topics, reach it by themselves.
-            IncludeLaunchDescription(localizer, launch_arguments={"map": LaunchConfiguration("map")}.items()),
+            IncludeLaunchDescription(localizer, launch_arguments=arguments.items()),
         ]
     )

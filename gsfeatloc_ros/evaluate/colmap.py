@@ -2,7 +2,7 @@
 
 COLMAP's poses map the world into the camera, with OpenCV's axes, and its pixels have the centre of the top-left one at
 (0.5, 0.5); both are turned into this package's conventions here. As 3DGS and Mip-NeRF360 do, every eighth photo by
-name is for testing and the others have made the map.
+name is for testing and the others have made the map. Photos may be smaller than the model's cameras say.
 """
 
 from __future__ import annotations

@@ -70,11 +70,23 @@ class MatcherSettings:
 
 
 @dataclass(frozen=True)
+class CpuSettings:
+    """What is taken of the CPU."""
+
+    threads: int = parameter(
+        0,
+        "Threads that compute at most: of numba, OpenMP (torch, faiss), OpenCV and BLAS; 0 takes all cores.",
+        (0, 1024),
+    )
+
+
+@dataclass(frozen=True)
 class RendererSettings:
     """What draws the map, and how."""
 
     device: str = parameter("auto", "Where to render, match and track: cpu, cuda, or auto to choose.", choices=DEVICES)
-    threads: int = parameter(0, "Threads of the CPU renderer; 0 takes all cores.", (0, 1024))
+    # Of the CPU renderer alone, for tools that measure; 0 takes as many as the process may have.
+    threads: int = 0
     sh_degree: int = parameter(3, "Highest degree of the spherical harmonics of the colours drawn.", (0, 3))
     resolution_scale: float = parameter(1.0, "Draw so many times the width and height, and enlarge that.", (0.1, 1.0))
 

@@ -7,8 +7,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from gsfeatloc_ros.common.device import choose_device
-from gsfeatloc_ros.common.openmp import wait_passively
 from gsfeatloc_ros.common.photo import Photo
+from gsfeatloc_ros.common.threads import wait_passively
 from gsfeatloc_ros.match.base import Features, Matcher, Matches, Tracker
 from gsfeatloc_ros.match.weights import WeightsError
 

@@ -101,6 +101,10 @@ class Reporter:
             self.error(f"the node goes on after a failure: {reason}\n{''.join(traceback.format_exception(error))}")
             self.diagnose("failure", ERROR, reason, {})
 
+    def say(self, reason: str) -> None:
+        """Log a warning, of what is said once."""
+        self._node.get_logger().warning(shortened(reason))
+
     def info(self, reason: str) -> None:
         """Log what is worth knowing."""
         self._node.get_logger().info(shortened(reason))

@@ -15,6 +15,7 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 
+from gsfeatloc_ros.common.threads import limit_threads
 from gsfeatloc_ros.common.words import in_one_line
 from gsfeatloc_ros.localize.engine import load_engine
 from gsfeatloc_ros.node.diagnostics import Reporter
@@ -23,9 +24,9 @@ from gsfeatloc_ros.node.map_change import PATH, MapChange
 from gsfeatloc_ros.node.parameters import (
     check_choices,
     declare_parameters,
+    prepare_change,
     read_settings,
     refuse_unreadable,
-    without_retired,
 )
 from gsfeatloc_ros.node.services import Services
 from gsfeatloc_ros.node.session import Session
@@ -70,6 +71,7 @@ class LocalizerNode(LifecycleNode):
         super().__init__("localizer")
         self._go_on = go_on
         self._settings = declare_parameters(self)
+        limit_threads(self._settings.cpu.threads)
         self._reporter = Reporter(self)
         # For good: tf2_ros's listener cannot be taken back.
         self._transforms = Transforms(self)
@@ -80,7 +82,7 @@ class LocalizerNode(LifecycleNode):
         self._change_state = self._service_change_state.callback
         self._service_change_state.callback = self._on_change_state
         refuse_unreadable(self)
-        self.add_pre_set_parameters_callback(lambda parameters: without_retired(self, parameters))
+        self.add_pre_set_parameters_callback(lambda parameters: prepare_change(self, parameters))
         self.add_on_set_parameters_callback(self._check_parameters)
         self.add_post_set_parameters_callback(self._use_parameters)
         min_backward = Duration(nanoseconds=-_MAX_STEP_BACK.nanoseconds)

@@ -7,7 +7,7 @@ import threading
 import time
 from typing import TYPE_CHECKING
 
-from gsfeatloc_ros.common.openmp import wait_passively
+from gsfeatloc_ros.common.threads import wait_passively
 from gsfeatloc_ros.common.words import in_one_line
 from gsfeatloc_ros.node.environment import check_environment
 from gsfeatloc_ros.node.stop import Stop, leave
@@ -39,9 +39,12 @@ def main(args: list[str] | None = None) -> int:
 
         from gsfeatloc_ros.node.executor import GuardedExecutor, HopelessError
         from gsfeatloc_ros.node.localizer_node import LocalizerNode
+        from gsfeatloc_ros.node.parameters import with_lists_of_doubles
 
         # rclpy's own handlers shut the context down at once; the running localization and requests are to end first.
-        rclpy.init(args=args, signal_handler_options=rclpy.signals.SignalHandlerOptions.NO)
+        rclpy.init(
+            args=with_lists_of_doubles(args or sys.argv), signal_handler_options=rclpy.signals.SignalHandlerOptions.NO
+        )
         stop.in_order = True
 
         def go_on() -> bool:

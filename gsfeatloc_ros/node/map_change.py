@@ -8,6 +8,7 @@ import threading
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
+from gsfeatloc_ros.common.paths import local_path
 from gsfeatloc_ros.common.words import in_one_line
 from gsfeatloc_ros.localize.engine import Engine, load_renderer
 from gsfeatloc_ros.node.diagnostics import ERROR, OK, Reporter
@@ -41,7 +42,7 @@ class MapChange:
             return
         if self._loading:
             raise ValueError(f"map {self._loading} is being loaded: wait for it")
-        if not os.path.exists(path):
+        if not os.path.exists(local_path(path)):
             raise ValueError(f"map.path: there is no {path!r}")
 
     def start(self, session: Session, settings: Settings) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
+from difflib import get_close_matches
 from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
@@ -21,6 +23,10 @@ _RETIRED = {
     "localizer.min_correlation": "localizer.max_risk",
     "localizer.min_agreement": "localizer.max_risk",
 }
+# Names that work for one more release, and what they are called now.
+_RENAMED = {"renderer.threads": "cpu.threads"}
+# Of parameters that rclpy declares with the topics.
+_QOS = "qos_overrides."
 
 _BY_NAME = {parameter.name: parameter for parameter in PARAMETERS}
 
@@ -42,20 +48,29 @@ def descriptor(parameter: Parameter) -> ParameterDescriptor:
 
 
 def declare_parameters(node: Node) -> Settings:
-    """Declare all parameters on a node and return their values.
+    """Declare all parameters on a node, warn of those given that are none, and return their values.
 
     Raises:
-        ValueError: a value that is not one of the choices.
-        rclpy.exceptions.ParameterException: a value of another type (a double needs a point: 5.0) or out of range.
+        ValueError: a value that is not one of the choices, or a path that cannot be used.
+        rclpy.exceptions.ParameterException: a value of another type or out of range.
     """
+    # rclpy has no other way to see what was given.
+    given = node._parameter_overrides
+    for old, new in _RENAMED.items():
+        if old in given:
+            node.get_logger().warning(f"parameter {old} is called {new} now: rename it")
+            given.setdefault(new, RosParameter(new, value=given.pop(old).value))
     for parameter in PARAMETERS:
+        if parameter.name in given:
+            given[parameter.name] = _as_declared(given[parameter.name])
         # Lists are tuples in settings, of which rclpy knows nothing.
         default = list(parameter.default) if isinstance(parameter.default, tuple) else parameter.default
         node.declare_parameter(parameter.name, default, descriptor(parameter))
-    for name in _RETIRED:
-        if node.declare_parameter(name, descriptor=ParameterDescriptor(dynamic_typing=True)).value is not None:
+    for name in given:
+        if name in _RETIRED:
             _warn_of_retired(node, name)
-        node.undeclare_parameter(name)
+        elif not node.has_parameter(name) and not name.startswith(_QOS):
+            _warn_of_unknown(node, name)
     check_choices([node.get_parameter(name) for name in _BY_NAME])
     return read_settings(node)
 
@@ -75,14 +90,14 @@ def check_choices(parameters: Sequence[RosParameter]) -> None:
             about.check(about.as_set(parameter.value))
 
 
-def without_retired(node: Node, parameters: Sequence[RosParameter]) -> list[RosParameter]:
-    """Return parameters that are about to be set, but for those without effect, of which the node warns."""
+def prepare_change(node: Node, parameters: Sequence[RosParameter]) -> list[RosParameter]:
+    """Return parameters that are about to be set, as they are declared; those without effect are warned of instead."""
     kept = []
     for parameter in parameters:
         if parameter.name in _RETIRED:
             _warn_of_retired(node, parameter.name)
         else:
-            kept.append(parameter)
+            kept.append(_as_declared(parameter))
     # rclpy says that setting no parameter fails: what was to be set instead stays as it is.
     return kept or [node.get_parameter(_RETIRED[parameter.name]) for parameter in parameters[:1]]
 
@@ -116,5 +131,35 @@ def _set_atomically(node: Node, messages: Sequence[ParameterMessage]) -> SetPara
         return SetParametersResult(successful=False, reason=shortened(f"{names} cannot be set: {in_one_line(error)}"))
 
 
+def with_lists_of_doubles(arguments: Sequence[str]) -> list[str]:
+    """Return command line arguments in which a list such as [0.0, 0, 1] has doubles alone: rcl takes no other."""
+
+    def doubles(match: re.Match[str]) -> str:
+        try:
+            return f"{match[1]}[{', '.join(str(float(number)) for number in match[2].split(','))}]"
+        except ValueError:
+            return match[0]
+
+    return [re.sub(r"^([\w.:/~*]+:=)\[(.*[.eE].*)\]$", doubles, argument) for argument in arguments]
+
+
+def _as_declared(parameter: RosParameter) -> RosParameter:
+    """Return a parameter with its integers as doubles where it is declared with these."""
+    declared, value = _BY_NAME.get(parameter.name), parameter.value
+    if declared is None:
+        return parameter
+    if isinstance(declared.default, float) and type(value) is int:
+        return RosParameter(parameter.name, value=float(value))
+    if isinstance(declared.default, tuple) and parameter.type_ is RosParameter.Type.INTEGER_ARRAY:
+        return RosParameter(parameter.name, value=[float(number) for number in value])
+    return parameter
+
+
 def _warn_of_retired(node: Node, name: str) -> None:
     node.get_logger().warning(f"parameter {name} has no effect any more: set {_RETIRED[name]} instead, and remove it")
+
+
+def _warn_of_unknown(node: Node, name: str) -> None:
+    near = get_close_matches(name, _BY_NAME, n=1)
+    advice = f"is it {near[0]}?" if near else "docs/parameters.md has them all"
+    node.get_logger().warning(f"parameter {name} is none of this node's, and has no effect: {advice}")

@@ -22,7 +22,7 @@ class PoseFile:
     """
 
     def __init__(self, path: str, map_: MapSettings, reporter: Reporter) -> None:
-        self._path = Path(path).expanduser() if path else None
+        self._path = Path(path) if path else None
         self._reporter = reporter
         self.use_map(map_)
 

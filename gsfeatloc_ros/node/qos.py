@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -32,6 +33,8 @@ ODOMETRY = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
 # where the processor cannot keep up with taking them: no more than these are kept.
 REQUESTS = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)
 IMAGE_REQUESTS = QoSProfile(depth=12)
+# Messages of a topic between the two times that one comes.
+_MAX_TWICE = 100
 
 
 def overridable() -> QoSOverridingOptions:
@@ -49,14 +52,63 @@ class Topic:
         message_type: of what comes on it.
         name: before remapping.
         qos: that is asked for.
+        latched: whether what was said before this node listened still holds, if its publisher keeps it.
+        needed: whether nothing is localized without it.
     """
 
     message_type: type
     name: str
     qos: QoSProfile
+    latched: bool = False
+    needed: bool = False
 
 
-def subscribe(node: Node, topic: Topic, callback: Callable[[Any], None], refuse: Callable[[str], None]) -> Subscription:
+@dataclass(eq=False)
+class Listener:
+    """A topic that is listened to.
+
+    Attributes:
+        topic: as it is asked for.
+        callback: that takes what comes.
+        subscriptions: the first is what every publisher should fit.
+    """
+
+    topic: Topic
+    callback: Callable[..., None]
+    subscriptions: list[Subscription]
+
+    @property
+    def name(self) -> str:
+        """Of the topic, after remapping."""
+        return self.subscriptions[0].topic_name
+
+    @property
+    def type_name(self) -> str:
+        """Of the messages, as the graph has it."""
+        message_type = self.topic.message_type
+        return f"{message_type.__module__.split('.')[0]}/msg/{message_type.__name__}"
+
+    @property
+    def qos(self) -> QoSProfile:
+        """That is asked for, overridden or not."""
+        return self.subscriptions[0].qos_profile
+
+    def hear_latched(self, node: Node) -> None:
+        """Hear what a publisher said before, if it keeps that and it still holds.
+
+        DDS gives that to those alone who ask for it, and to these nothing of who does not keep it, with a warning in
+        its log: who only might be there is not asked.
+        """
+        if not self.topic.latched or len(self.subscriptions) > 1:
+            return
+        publishers = node.get_publishers_info_by_topic(self.name)
+        kept = [p for p in publishers if p.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL]
+        if any(publisher.topic_type == self.type_name for publisher in kept):
+            message_type, name = self.topic.message_type, self.topic.name
+            self.subscriptions.append(node.create_subscription(message_type, name, self.callback, LAST))
+
+
+def subscribe(node: Node, topic: Topic, callback: Callable[[Any], None], refuse: Callable[[str], None]) -> Listener:
     """Subscribe with a QoS that can be overridden; `refuse` gets the reason why that of a publisher does not fit."""
     name = node.resolve_topic_name(topic.name)
 
@@ -67,11 +119,26 @@ def subscribe(node: Node, topic: Topic, callback: Callable[[Any], None], refuse:
             f"qos_overrides.{name}.subscription.{policy} to what it offers (ros2 topic info --verbose {name})"
         )
 
-    return node.create_subscription(
+    taken: Callable[..., None] = _once(callback) if topic.latched else callback
+    first = node.create_subscription(
         topic.message_type,
         topic.name,
-        callback,
+        taken,
         topic.qos,
         event_callbacks=SubscriptionEventCallbacks(incompatible_qos=incompatible),
         qos_overriding_options=overridable(),
     )
+    return Listener(topic, taken, [first])
+
+
+def _once(callback: Callable[[Any], None]) -> Callable[[Any, Any], None]:
+    """Return a callback of two subscriptions to the same topic, to which a message may come twice."""
+    seen: deque[int] = deque(maxlen=_MAX_TWICE)
+
+    def take(message: Any, info: Any) -> None:
+        stamp = info["source_timestamp"]
+        if stamp not in seen:
+            seen.append(stamp)
+            callback(message)
+
+    return take

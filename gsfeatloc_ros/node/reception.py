@@ -10,11 +10,10 @@ from typing import Any
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from rclpy.node import Node
-from rclpy.subscription import Subscription
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from gsfeatloc_ros.node.attempts import Job
-from gsfeatloc_ros.node.qos import NEWEST, ODOMETRY, RELIABLE, Topic, subscribe
+from gsfeatloc_ros.node.qos import NEWEST, ODOMETRY, RELIABLE, Listener, Topic, subscribe
 from gsfeatloc_ros.node.report import Report
 from gsfeatloc_ros.ros_io.decode import nanoseconds
 from gsfeatloc_ros.ros_io.inputs import Inputs, InputTopic
@@ -23,11 +22,11 @@ from gsfeatloc_ros.ros_io.schedule import Schedule
 from gsfeatloc_ros.ros_io.settings import COMPRESSED, Settings
 
 _TOPICS = (
-    (Topic(CameraInfo, "camera_info", NEWEST), InputTopic.CAMERA_INFO),
-    (Topic(PoseStamped, "prior", RELIABLE), InputTopic.PRIOR),
-    (Topic(PoseWithCovarianceStamped, "prior_with_covariance", RELIABLE), InputTopic.PRIOR),
-    (Topic(Odometry, "prior_odometry", RELIABLE), InputTopic.PRIOR),
-    (Topic(PoseWithCovarianceStamped, "initialpose", RELIABLE), InputTopic.INITIAL_POSE),
+    (Topic(CameraInfo, "camera_info", NEWEST, latched=True, needed=True), InputTopic.CAMERA_INFO),
+    (Topic(PoseStamped, "prior", RELIABLE, latched=True), InputTopic.PRIOR),
+    (Topic(PoseWithCovarianceStamped, "prior_with_covariance", RELIABLE, latched=True), InputTopic.PRIOR),
+    (Topic(Odometry, "prior_odometry", RELIABLE, latched=True), InputTopic.PRIOR),
+    (Topic(PoseWithCovarianceStamped, "initialpose", RELIABLE, latched=True), InputTopic.INITIAL_POSE),
 )
 _ODOMETRY_TOPIC = (Topic(Odometry, "odom", ODOMETRY), InputTopic.ODOMETRY)
 
@@ -52,19 +51,26 @@ class Reception:
         compressed = settings.image.transport == COMPRESSED
         image_type = CompressedImage if compressed else Image
         # As image_transport does: a remapping of image holds for the compressed ones as well.
-        name = node.resolve_topic_name("image") + "/compressed" if compressed else "image"
-        self._image_topic = Topic(image_type, name, NEWEST)
+        name = node.resolve_topic_name("image").removesuffix("/compressed") + "/compressed" if compressed else "image"
+        self._image_topic = Topic(image_type, name, NEWEST, needed=True)
         resolved = node.resolve_topic_name(name)
         self.no_image = f"no image yet: publish sensor_msgs/{image_type.__name__} on {resolved}"
         # The newest image, or why it cannot be used.
         self._job: Job | str = self.no_image
         self._schedule = Schedule(settings.node)
-        self._subscriptions: list[Subscription] = []
+        self._listeners: list[Listener] = []
+        # Names of the topics on which something came.
+        self._heard: set[str] = set()
 
     @property
     def topics(self) -> list[str]:
         """Names of the topics that are listened to, remapped."""
-        return [subscription.topic_name for subscription in self._subscriptions]
+        return [listener.name for listener in self._listeners]
+
+    @property
+    def unheard(self) -> list[Listener]:
+        """The topics on which nothing came yet."""
+        return [listener for listener in self._listeners if listener.topic.name not in self._heard]
 
     def listen(self) -> None:
         """Subscribe to all topics."""
@@ -75,9 +81,11 @@ class Reception:
 
     def stop_listening(self) -> None:
         """Unsubscribe, and forget the newest image."""
-        for subscription in self._subscriptions:
-            self._node.destroy_subscription(subscription)
-        self._subscriptions = []
+        for listener in self._listeners:
+            for subscription in listener.subscriptions:
+                self._node.destroy_subscription(subscription)
+        self._listeners = []
+        self._heard.clear()
         self._job = self.no_image
 
     def use_settings(self, settings: Settings) -> None:
@@ -102,7 +110,12 @@ class Reception:
 
     def _subscribe(self, topic: Topic, callback: Callable[[Any], None]) -> None:
         refuse = partial(self._report.refuse, f"qos of {topic.name}")
-        self._subscriptions.append(subscribe(self._node, topic, callback, refuse))
+
+        def take(message: Any) -> None:
+            self._heard.add(topic.name)
+            callback(message)
+
+        self._listeners.append(subscribe(self._node, topic, take, refuse))
 
     def _on_image(self, message: Image | CompressedImage) -> None:
         self._report.count_image()

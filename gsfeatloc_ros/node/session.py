@@ -10,6 +10,7 @@ from rclpy.node import Node
 from gsfeatloc_ros.localize.engine import Engine
 from gsfeatloc_ros.node.attempts import Attempts, Outputs
 from gsfeatloc_ros.node.diagnostics import OK, Reporter
+from gsfeatloc_ros.node.graph import GraphWatch
 from gsfeatloc_ros.node.index_build import IndexBuild
 from gsfeatloc_ros.node.pose_file import PoseFile
 from gsfeatloc_ros.node.publishers import Publishers
@@ -80,6 +81,7 @@ class Session:
         outputs = Outputs(self._publishers, self._standing, self._pose_file, self.report)
         self.attempts = Attempts(engine, self._follower, outputs)
         self.reception = Reception(node, settings, inputs, self.report, self.attempts.offer)
+        self._graph = GraphWatch(node, reporter)
         self._index_build = IndexBuild(self.attempts, reporter)
         self._index_build.start(settings)
         # On a clock of its own: that of a simulation may stand still.
@@ -100,6 +102,7 @@ class Session:
     def activate(self) -> None:
         """Listen and publish."""
         self.reception.listen()
+        self._graph.begin()
         self.active = self.attempts.publishing = True
         settings, engine = self.settings, self.engine
         self._node.get_logger().info(
@@ -188,10 +191,11 @@ class Session:
         if self.active:
             self._follower.pass_time(mode == CONTINUOUS)
             self._standing.publish()
-        level, reason = OK, "inactive"
+        level, reason, missing = OK, "inactive", ""
         if self.active:
+            missing = self._graph.look(self.reception.unheard, mode)
             level, reason = self.report.health.assess(
-                self.settings.image.timeout, mode != ON_REQUEST, self.reception.no_image
+                self.settings.image.timeout, mode != ON_REQUEST, missing or self.reception.no_image
             )
         age = "nan" if last is None else f"{1e-9 * (self._node.get_clock().now().nanoseconds - last):.1f}"
         renderer = self.engine.renderer
@@ -204,5 +208,6 @@ class Session:
             "answer_age": age,
             "requests_waiting": str(self.attempts.waiting),
             "requests_busy": str(self.attempts.unserved),
+            "missing": missing,
         }
         self.report.publish_health(level, reason, about)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from gsfeatloc_ros.common.device import DEVICES, choose_device, device_without
-from gsfeatloc_ros.common.openmp import wait_passively
+from gsfeatloc_ros.common.threads import wait_passively
 from gsfeatloc_ros.maps.gaussian_map import GaussianMap
 from gsfeatloc_ros.render.base import DEFAULT_DRAW_OPTIONS, DrawOptions, Render, Renderer, SplatRenderer
 

@@ -8,9 +8,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from gsfeatloc_ros.common.parameter import Parameter, Value, parameter, parameters_of, settings_from
+from gsfeatloc_ros.common.paths import local_path
 from gsfeatloc_ros.index import IndexOptions
 from gsfeatloc_ros.localize.options import LocalizerOptions
-from gsfeatloc_ros.localize.settings import MapSettings, MatcherSettings, RendererSettings
+from gsfeatloc_ros.localize.settings import CpuSettings, MapSettings, MatcherSettings, RendererSettings
+from gsfeatloc_ros.ros_io.decode import frame_name
 from gsfeatloc_ros.ros_io.extrinsics import AnswerFrames
 from gsfeatloc_ros.ros_io.growth import GrowthOptions
 from gsfeatloc_ros.ros_io.prior import PriorPolicy
@@ -158,6 +160,7 @@ class Settings:
     image: ImageSettings = field(default_factory=ImageSettings)
     matcher: MatcherSettings = field(default_factory=MatcherSettings)
     renderer: RendererSettings = field(default_factory=RendererSettings)
+    cpu: CpuSettings = field(default_factory=CpuSettings)
     localizer: LocalizerOptions = field(default_factory=LocalizerOptions)
     requests: RequestSettings = field(default_factory=RequestSettings)
     recovery: RecoverySettings = field(default_factory=RecoverySettings)
@@ -166,13 +169,19 @@ class Settings:
 
     @staticmethod
     def of(values: Mapping[str, Value]) -> Settings:
-        """Return the settings of parameter values by name; those that are not there have their defaults."""
+        """Return the settings of parameter values by name; those that are not there have their defaults.
+
+        Raises:
+            ValueError: a path that is none of this machine.
+        """
+        values = {name: _cleaned(name, value) for name, value in values.items()}
         return Settings(
             node=settings_from(NodeSettings, values),
             map=settings_from(MapSettings, values, "map."),
             image=settings_from(ImageSettings, values, "image."),
             matcher=settings_from(MatcherSettings, values, "matcher."),
             renderer=settings_from(RendererSettings, values, "renderer."),
+            cpu=settings_from(CpuSettings, values, "cpu."),
             localizer=settings_from(LocalizerOptions, values, "localizer."),
             requests=settings_from(RequestSettings, values, "requests."),
             recovery=settings_from(RecoverySettings, values, "search."),
@@ -213,12 +222,24 @@ class Settings:
 
 
 _OF_ROS = ("use_sim_time", "qos_overrides.", "start_type_description_service")
+_PATHS = ("map.path", "map.dataparser_transforms", "matcher.weights", "state.path", "index.path")
+_FRAMES = ("map.frame_id", "base_frame", "odom_frame")
+
+
+def _cleaned(name: str, value: Value) -> Value:
+    """Return the value of a parameter as it is used: paths without `~` and file://, frames without a leading slash."""
+    if name in _PATHS:
+        return local_path(str(value))
+    return frame_name(str(value)) if name in _FRAMES else value
+
+
 _GROUPS = {
     "": NodeSettings,
     "map.": MapSettings,
     "image.": ImageSettings,
     "matcher.": MatcherSettings,
     "renderer.": RendererSettings,
+    "cpu.": CpuSettings,
     "localizer.": LocalizerOptions,
     "requests.": RequestSettings,
     "search.": RecoverySettings,

@@ -36,17 +36,20 @@ while it runs:
 
     ros2 param set /localizer max_rate 5.0
 
-A double needs its point (`5.0`, not `5`). What is of another type, out of range or none of the choices is refused with
-the reason. Only `map.path` has to be given.
+An integer is taken for a double. What is of another type, out of range or none of the choices is refused with the
+reason, and a name that is none of these is named in the log, with the nearest that is. Paths may begin with `~` or
+`file://`. Only `map.path` has to be given.
 
 `localizer.min_inlier_ratio`, `localizer.min_correlation` and `localizer.min_agreement` have no effect any more; until
-the next release they are accepted, with a warning. Set `localizer.max_risk` instead.
+the next release they are accepted, with a warning. Set `localizer.max_risk` instead. So is `renderer.threads`, which is
+`cpu.threads` now.
 """
 _GROUP_HEADS = {
     "": "## The node\n\nWhen it localizes, and of what its priors and answers are poses.",
     "map": "## map\n\nWhich map, and where it lies: [The map](topics-and-services.md#the-map).",
     "image": "## image\n\nHow images come.",
     "matcher": "## matcher\n\nWhich features: [matchers.md](matchers.md).",
+    "cpu": "## cpu\n\nWhat is taken of the CPU.",
     "renderer": "## renderer\n\nWhat draws the map, and how: [renderer.md](renderer.md), [gpu.md](gpu.md).",
     "localizer": "## localizer\n\nHow an image is localized, and what must speak for an answer: [trust.md](trust.md).",
     "requests": "## requests\n\nHow many requests are taken: [Services](topics-and-services.md#services).",

@@ -28,6 +28,16 @@ class DeclareLaunchArgument:
 
 
 @dataclass
+class OpaqueFunction:
+    function: Callable = field(kw_only=True)
+
+
+@dataclass
+class LaunchContext:
+    launch_configurations: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass
 class ExecuteProcess:
     cmd: list[Any] = field(kw_only=True)
     output: str = field(default="log", kw_only=True)
@@ -68,6 +78,9 @@ class LaunchConfiguration:
     variable_name: str
     default: Any = field(default=None, kw_only=True)
 
+    def perform(self, context: LaunchContext) -> str:
+        return context.launch_configurations[self.variable_name]
+
 
 @dataclass
 class PathJoinSubstitution:
@@ -85,12 +98,6 @@ class Node:
     output: str = field(default="log", kw_only=True)
 
 
-@dataclass
-class SetParameter:
-    name: str
-    value: Any
-
-
 @dataclass(frozen=True)
 class ParameterValue:
     value: Any
@@ -103,11 +110,12 @@ class FindPackageShare:
 
 
 _MODULES = {
-    "launch": (LaunchDescription,),
+    "launch": (LaunchContext, LaunchDescription),
     "launch.actions": (
         DeclareLaunchArgument,
         ExecuteProcess,
         IncludeLaunchDescription,
+        OpaqueFunction,
         RegisterEventHandler,
         Shutdown,
     ),
@@ -116,7 +124,7 @@ _MODULES = {
     "launch.events.process": (ProcessIO,),
     "launch.substitutions": (LaunchConfiguration, PathJoinSubstitution),
     "launch_ros": (),
-    "launch_ros.actions": (Node, SetParameter),
+    "launch_ros.actions": (Node,),
     "launch_ros.parameter_descriptions": (ParameterValue,),
     "launch_ros.substitutions": (FindPackageShare,),
 }

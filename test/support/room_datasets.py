@@ -19,10 +19,11 @@ OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # from OpenGL's camera axes to ours
 
 
 def save_image(path: Path, pixels: np.ndarray) -> None:
-    """Write an image (H, W, 3 or 4), RGB or RGBA."""
+    """Write an image (H, W, 3 or 4), RGB or RGBA, or a grey one (H, W)."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    code = cv2.COLOR_RGBA2BGRA if pixels.shape[2] == 4 else cv2.COLOR_RGB2BGR
-    assert cv2.imwrite(str(path), cv2.cvtColor(pixels, code))
+    if pixels.ndim == 3:
+        pixels = cv2.cvtColor(pixels, cv2.COLOR_RGBA2BGRA if pixels.shape[2] == 4 else cv2.COLOR_RGB2BGR)
+    assert cv2.imwrite(str(path), pixels)
 
 
 def write_nerf_synthetic(

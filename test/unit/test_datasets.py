@@ -6,6 +6,7 @@ import sys
 
 import cv2
 import numpy as np
+import PIL.Image
 import pycolmap
 import pytest
 from room_datasets import angle_x, colmap_camera, save_image, write_colmap, write_nerf_synthetic
@@ -373,6 +374,49 @@ def test_colmap_without_a_folder_0(tmp_path):
     scene = load_scene(tmp_path, "map.ply")
     # The photo is half as large as its model's camera, whose middle is at 4 where the corner is at 0.
     np.testing.assert_allclose(scene.camera.K, [[2, 0, 1.5], [0, 2, 1], [0, 0, 1]], atol=1e-9)
+
+
+def test_photos_smaller_than_their_models_camera(tmp_path):
+    parameters = [1200, 1240, 641, 481, -0.12, 0.03, 0.002, -0.001]
+    write_colmap(tmp_path, [("OPENCV", 1283, 963, parameters)], [("a.png", 0, np.eye(4))])
+    save_image(tmp_path / "images/a.png", np.full((241, 321, 3), 9, np.uint8))
+    scene = load_scene(tmp_path, "map.ply")
+    assert scene.read_photo(scene.photos[0]).shape == (241, 321, 3)
+    theirs = pycolmap.Camera(model="OPENCV", width=1283, height=963, params=parameters)
+    theirs.rescale(321, 241)
+    points = np.array([[0.1, -0.2, 1.0], [-0.3, 0.25, 1.0]])
+    pixels = theirs.img_from_cam(points) - 0.5
+    np.testing.assert_allclose(scene.camera.rays(scene.camera.undistort(pixels)), points, atol=1e-6)
+    # One that was cut is no smaller one.
+    save_image(tmp_path / "images/a.png", np.zeros((200, 321, 3), np.uint8))
+    scene = load_scene(tmp_path, "map.ply")
+    with pytest.raises(ValueError, match="is 321x200, its camera is 1283x963"):
+        scene.read_photo(scene.photos[0])
+
+
+@pytest.mark.parametrize(("width", "height"), [(8, 6), (6, 8)])
+def test_a_photo_of_a_phone_is_turned_where_its_camera_is(tmp_path, width, height):
+    """COLMAP's camera is that of the pixels as stored, other programs' that of the photo as EXIF turns it."""
+    stored = np.full((6, 8, 3), 60, np.uint8)
+    stored[:, :4] = 200
+    exif = PIL.Image.Exif()
+    exif[0x0112] = 6  # to be turned by 90 degrees, clockwise
+    (tmp_path / "images").mkdir()
+    PIL.Image.fromarray(stored).save(tmp_path / "images/a.jpg", exif=exif, quality=100)
+    write_colmap(tmp_path, [("PINHOLE", width, height, [4, 4, 4, 3])], [("a.jpg", 0, np.eye(4))])
+    scene = load_scene(tmp_path, "map.ply")
+    expected = stored if width == 8 else np.rot90(stored, -1)
+    assert np.abs(scene.read_photo(scene.photos[0]).astype(int) - expected).max() < 9
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+@pytest.mark.parametrize("shape", [(6, 8), (6, 8, 3)])
+def test_photos_that_are_grey_or_of_16_bits(tmp_path, dtype, shape):
+    white = np.iinfo(dtype).max
+    save_image(tmp_path / "images/a.png", np.full(shape, white // 5, dtype))
+    write_colmap(tmp_path, [("PINHOLE", 8, 6, [4, 4, 4, 3])], [("a.png", 0, np.eye(4))])
+    scene = load_scene(tmp_path, "map.ply")
+    assert (scene.read_photo(scene.photos[0]) == np.full((6, 8, 3), 51, np.uint8)).all()
 
 
 def test_colmap_with_several_cameras(tmp_path):

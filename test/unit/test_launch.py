@@ -16,12 +16,13 @@ from launch_stand_in import (
     FindPackageShare,
     IncludeLaunchDescription,
     LaunchConfiguration,
+    LaunchContext,
     Node,
+    OpaqueFunction,
     ParameterValue,
     PathJoinSubstitution,
     ProcessIO,
     RegisterEventHandler,
-    SetParameter,
     Shutdown,
 )
 
@@ -65,7 +66,9 @@ def made(name: str, kind: type) -> list:
 
 def test_arguments_of_the_localizer(any_launch):
     given = arguments("localizer")
-    assert list(given) == ["map", "params_file", "namespace", *load("localizer").TOPICS]
+    launch = load("localizer")
+    others = ["map", "params_file", "namespace", "transport", "use_sim_time", "camera_info"]
+    assert list(given) == [*others, *launch.INPUTS, *launch.OUTPUTS]
     assert [name for name, default in given.items() if default is None] == ["map"]
 
 
@@ -80,24 +83,52 @@ def test_every_argument_is_described(any_launch):
         assert all(argument.description for argument in declared(name))
 
 
-def test_topics_are_those_that_the_node_subscribes_to(any_launch):
-    profile = ElementTree.parse(ROOT / "config/localizer.policy.xml").getroot().iter("topics")
-    subscribed = {topic.text for group in profile if group.get("subscribe") for topic in group}
-    assert set(load("localizer").TOPICS) <= subscribed
+def test_topics_are_those_of_the_node(any_launch):
+    profile = list(ElementTree.parse(ROOT / "config/localizer.policy.xml").getroot().iter("topics"))
+    subscribed, published = (
+        {topic.text for group in profile if group.get(way) for topic in group} for way in ("subscribe", "publish")
+    )
+    launch = load("localizer")
+    of_others = {"image/compressed", "/tf", "/tf_static", "/clock"}
+    assert {"camera_info", *launch.INPUTS} == subscribed - of_others
+    assert set(launch.OUTPUTS) == {topic for topic in published if topic[0] not in "/~"}
+
+
+def started(**given: str) -> Node:
+    """Return the node that the localizer's launch file makes of arguments."""
+    (made_by,) = made("localizer", OpaqueFunction)
+    defaults = {name: default for name, default in arguments("localizer").items() if isinstance(default, str)}
+    (node,) = made_by.function(LaunchContext(defaults | {"map": "5", "params_file": "a.yaml"} | given))
+    return node
 
 
 def test_the_localizer_is_started_with_its_parameters_and_topics(stand_in):
-    (node,) = made("localizer", Node)
+    node = started(namespace="robot", odom="/odom")
     assert (node.package, node.executable, node.name) == ("gsfeatloc_ros", "localizer", "localizer")
-    assert node.namespace == LaunchConfiguration("namespace")
-    topics = load("localizer").TOPICS
-    assert node.remappings == [(topic, LaunchConfiguration(topic)) for topic in topics]
-    assert [arguments("localizer")[topic] for topic in topics] == list(topics)
-    # Later ones win: the map that is named is the one that is loaded. It may look like a number, and is text.
-    assert node.parameters == [
-        LaunchConfiguration("params_file"),
-        {"map.path": ParameterValue(LaunchConfiguration("map"), value_type=str)},
-    ]
+    assert node.namespace == "robot"
+    launch = load("localizer")
+    expected = {topic: topic for topic in ("camera_info", *launch.INPUTS, *launch.OUTPUTS)} | {"odom": "/odom"}
+    assert dict(node.remappings) == expected
+    # The map that is named is the one that is loaded; what else the file says stays.
+    path = ParameterValue("5", value_type=str)
+    assert node.parameters == ["a.yaml", {"map.path": path, "use_sim_time": False}]
+    node = started(transport="compressed", use_sim_time="true")
+    assert node.parameters[1] == {"map.path": path, "use_sim_time": True, "image.transport": "compressed"}
+
+
+@pytest.mark.parametrize(
+    ("image", "camera_info", "expected"),
+    [
+        ("/camera/image_raw", "", "/camera/camera_info"),
+        ("/left/camera/color/image_raw", "", "/left/camera/color/camera_info"),
+        ("camera/image_raw", "", "camera/camera_info"),
+        ("/image_raw", "", "/camera_info"),
+        ("image", "", "camera_info"),
+        ("/camera/image_raw", "/info", "/info"),
+    ],
+)
+def test_camera_info_is_the_one_beside_the_image(stand_in, image, camera_info, expected):
+    assert dict(started(image=image, camera_info=camera_info).remappings)["camera_info"] == expected
 
 
 def test_the_default_parameters_are_the_packages(stand_in):
@@ -113,8 +144,7 @@ def test_replay_starts_the_localizer_on_the_map_and_the_clock_of_the_bag(stand_i
     assert isinstance(included.launch_description_source, PathJoinSubstitution)
     assert package == FindPackageShare("gsfeatloc_ros")
     assert ROOT.joinpath(*parts) == ROOT / "launch" / "localizer.launch.py"
-    assert dict(included.launch_arguments) == {"map": LaunchConfiguration("map")}
-    assert made("replay", SetParameter) == [SetParameter("use_sim_time", True)]
+    assert dict(included.launch_arguments) == {"map": LaunchConfiguration("map"), "use_sim_time": "true"}
 
 
 def test_replay_plays_the_bag_once_the_localizer_is_ready(stand_in):
@@ -134,9 +164,8 @@ def test_replay_plays_the_bag_once_the_localizer_is_ready(stand_in):
 def test_arguments_are_those_that_are_used(stand_in):
     (registered,) = made("replay", RegisterEventHandler)
     played = registered.event_handler.on_stdout(ProcessIO(text=b"[localizer]: ready"))
-    for name, more in (("localizer", []), ("replay", played)):
-        used = set(configurations([*load(name).description.entities, *more]))
-        assert used == set(arguments(name)), name
+    used = set(configurations([*load("replay").description.entities, *played]))
+    assert used == set(arguments("replay"))
 
 
 def configurations(value: object) -> list[str]:

@@ -129,6 +129,7 @@ def test_options_of_the_localizer_are_parameters_but_for_those_of_experts():
 
 def test_the_page_names_those_that_have_no_effect_any_more():
     """They are accepted for one release: none of them is a parameter."""
+    assert "renderer.threads" not in DEFAULTS
     retired = {f"localizer.{name}" for name in ("min_inlier_ratio", "min_correlation", "min_agreement")}
     assert not retired & DEFAULTS.keys()
     assert all(f"`{name}`" in page_text() and name not in yaml_text() for name in retired)
