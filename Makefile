@@ -20,9 +20,9 @@ help:
 demo: build
 	@. scripts/env.sh && python -m gsfeatloc_ros.tools.demo
 
-# -P: what is tested is what is installed, not the sources here.
+# -P: what is tested is what is installed, not the sources here. Tests of the node go by the clock: one at a time.
 test: lint build
-	@. scripts/env.sh && python -P -m pytest
+	@. scripts/env.sh && python -P -m pytest -n 2 --dist loadfile test/unit test/gpu test/real && python -P -m pytest test/node
 
 # The option named last counts: the one of pyproject.toml comes before it.
 nightly: build

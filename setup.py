@@ -92,6 +92,7 @@ setup(
             "hypothesis>=6.100,<7",
             "mypy>=1.13,<2",
             "pytest>=8,<9",
+            "pytest-xdist>=3.6,<4",
             "ruff>=0.9,<1",
             "types-pyyaml>=6,<7",
         ],
