@@ -30,6 +30,8 @@ from fuzz_targets import Target, mutated, targets
 # Seconds that an input may take, and bytes that the process may have.
 HANG = 10.0
 MEMORY = 6 << 30
+# Started anew, for the threads of OpenMP, faiss's say, do not live on in a fork: it waits for them for ever.
+PROCESSES = multiprocessing.get_context("spawn")
 OUTCOMES = ("accepted", "refused", "crash", "hang")
 
 
@@ -38,11 +40,11 @@ class Counts:
 
     def __init__(self, names: list[str]) -> None:
         self.names = names
-        self.ended: SynchronizedArray = multiprocessing.Array("q", len(names) * len(OUTCOMES))
-        self.next: Synchronized = multiprocessing.Value("q", 0)
-        self.started: Synchronized = multiprocessing.Value("d", 0.0)
-        self.running: Synchronized = multiprocessing.Value("q", 0)
-        self.peak: Synchronized = multiprocessing.Value("q", 0)
+        self.ended: SynchronizedArray = PROCESSES.Array("q", len(names) * len(OUTCOMES))
+        self.next: Synchronized = PROCESSES.Value("q", 0)
+        self.started: Synchronized = PROCESSES.Value("d", 0.0)
+        self.running: Synchronized = PROCESSES.Value("q", 0)
+        self.peak: Synchronized = PROCESSES.Value("q", 0)
 
     def add(self, target: int, outcome: str) -> None:
         """Count one more."""
@@ -114,7 +116,7 @@ def campaign(seconds: float, inputs: int, seed: int, kept: Path) -> Counts:
             shutil.rmtree(folder)
             folder.mkdir()
             counts.started.value = 0.0
-            worker = multiprocessing.get_context("fork").Process(target=work, args=(counts, folder, kept, seed, until))
+            worker = PROCESSES.Process(target=work, args=(counts, folder, kept, seed, until))
             worker.start()
             watch(worker, counts)
             if worker.exitcode:
