@@ -37,7 +37,7 @@ _ROW_HEIGHT = 42
 # Fields take whole columns: numbers stay in their places from picture to picture. The evidence has two rows of them.
 _COLUMN_WIDTH = 104
 _COLUMN_GAP = 12
-_EVIDENCE_ROWS = 2
+_EVIDENCE_ROWS = 3
 # Room kept for the reason: nearly all pictures are of one height, as recorders of video want them.
 _MIN_REASON_LINES = 2
 

@@ -88,15 +88,6 @@ def test_antialiased_flag_is_kept(tmp_path, antialiased):
     assert [load_prepared(path).antialiased for _ in range(2)] == [antialiased] * 2
 
 
-def test_map_without_visible_gaussians_is_kept(tmp_path, preparations):
-    path = tmp_path / "map.ply"
-    gaussian_map = two_rooms(300)
-    gaussian_map.opacities[:] = 0
-    write_ply(path, gaussian_map)
-    assert_same(load_prepared(path), load_prepared(path))
-    assert len(preparations) == 1
-
-
 def test_alignment_is_no_part_of_the_cache(map_file, preparations):
     alignment = Similarity(2.0, so3_exp(np.array([0.1, 0.2, 0.3])), np.ones(3))
     assert load_prepared(map_file).S_map_splat.scale == 1.0

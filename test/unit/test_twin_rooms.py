@@ -72,7 +72,7 @@ def test_rooms_that_are_identical_are_both_candidates_and_none_is_the_answer(in_
 def test_the_index_knows_by_which_motions_the_rooms_are_alike(index) -> None:
     for sign in (-1, 1):
         there = sign * SECOND[:3, 3]
-        assert any(translation_error(motion, make_pose(np.eye(3), there)) < 0.1 for motion in index.look_alikes)
+        assert any(translation_error(motion, make_pose(np.eye(3), there)) < 0.2 for motion in index.look_alikes)
 
 
 def test_a_prior_decides_between_identical_rooms(in_identical, photos) -> None:
