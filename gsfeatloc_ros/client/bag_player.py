@@ -36,6 +36,11 @@ class Topics:
     prior: str
     others: tuple[Topic, ...] = ()
 
+    @property
+    def remappings(self) -> dict[str, str]:
+        """The localizer's names of the topics, and what they are called in the bag."""
+        return {"image": self.image, "camera_info": self.camera_info, "prior": self.prior}
+
 
 @dataclass(frozen=True, eq=False)
 class Reply:

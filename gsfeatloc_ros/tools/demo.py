@@ -14,7 +14,6 @@ import argparse
 import shutil
 import sys
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict
 from pathlib import Path
 
 import cv2
@@ -59,7 +58,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     isolate_ros()
     parameters = {"map.path": map_file.resolve(), "matcher.name": args.matcher}
     try:
-        with running_localizer(parameters, asdict(TOPICS), log) as localizer:
+        with running_localizer(parameters, TOPICS.remappings, log) as localizer:
             print(f"localizer: started with {args.matcher}, its log in {log}", flush=True)
             localizer.wait_for_output(INDEX_READY, START_TIMEOUT)
             print("localizer: knows what the room looks like from anywhere\n", flush=True)

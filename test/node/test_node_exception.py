@@ -20,7 +20,7 @@ class OutOfMemory:
 
     def __init__(self, renderer) -> None:
         self._renderer = renderer
-        self.device = renderer.device
+        self.device, self.reading = renderer.device, renderer.reading
         self.set_off = False
 
     def render(self, *arguments):
