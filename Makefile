@@ -20,9 +20,10 @@ help:
 demo: build
 	@. scripts/env.sh && python -m gsfeatloc_ros.tools.demo
 
-# -P: what is tested is what is installed, not the sources here. Tests of the node go by the clock: one at a time.
+# -P: what is tested is what is installed, not the sources here. Those of the node mostly wait: apart from those that
+# compute, which would let them wait too long.
 test: lint build
-	@. scripts/env.sh && python -P -m pytest -n 2 --dist loadfile test/unit test/gpu test/real && python -P -m pytest test/node
+	@. scripts/env.sh && for part in "test/unit test/gpu test/real" test/node; do python -P -m pytest -n 2 --dist loadfile $$part || exit; done
 
 # The option named last counts: the one of pyproject.toml comes before it.
 nightly: build

@@ -37,6 +37,7 @@ TOPICS = Topics(IMAGE_TOPIC, CAMERA_INFO_TOPIC, PRIOR_TOPIC)
 # A camera of 65 degrees with the barrel distortion of a cheap lens.
 _K = [[500.0, 0.0, 322.0], [0.0, 502.0, 236.0], [0.0, 0.0, 1.0]]
 _CAMERA = Camera(640, 480, np.array(_K), np.array([-0.28, 0.09, 0.0008, -0.0005, 0.0]))
+_VIEWS = 120
 _PICTURE_ROWS = 4
 _KIDNAPPINGS = 5
 
@@ -56,7 +57,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     print(f"bag: {len(photos)} photos with priors, in {bag}", flush=True)
 
     isolate_ros()
-    parameters = {"map.path": map_file.resolve(), "matcher.name": args.matcher}
+    # A room needs few views, and the user is waiting.
+    parameters = {"map.path": map_file.resolve(), "matcher.name": args.matcher, "index.views": _VIEWS}
     try:
         with running_localizer(parameters, TOPICS.remappings, log) as localizer:
             print(f"localizer: started with {args.matcher}, its log in {log}", flush=True)

@@ -82,7 +82,9 @@ class NodeProcess(process.LocalizerProcess):
 
 def node_arguments(**parameters: object) -> list[str]:
     """Return the command line that sets `parameters`; `__` in a name stands for the dot."""
-    return process.node_arguments({name.replace("__", "."): value for name, value in parameters.items()})
+    given = {name.replace("__", "."): value for name, value in parameters.items()}
+    # Enough for a room, and made in seconds.
+    return process.node_arguments({"index.views": 60} | given)
 
 
 @contextmanager
