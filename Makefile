@@ -20,10 +20,13 @@ help:
 demo: build
 	@. scripts/env.sh && python -m gsfeatloc_ros.tools.demo
 
-# -P: what is tested is what is installed, not the sources here. Those of the node mostly wait: apart from those that
-# compute, which would let them wait too long.
+# -P: what is tested is what is installed, not the sources here. Tests of the node mostly wait: apart from those that
+# compute, which would let them wait too long; and those that say in how many seconds it ends, alone.
 test: lint build
-	@. scripts/env.sh && for part in "test/unit test/gpu test/real" test/node; do python -P -m pytest -n 2 --dist loadfile $$part || exit; done
+	@. scripts/env.sh && tests="python -P -m pytest" && \
+	$$tests -n 2 --dist loadfile test/unit test/gpu test/real && \
+	$$tests -n 2 --dist loadfile test/node --ignore test/node/test_node_stop.py && \
+	$$tests test/node/test_node_stop.py
 
 # The option named last counts: the one of pyproject.toml comes before it.
 nightly: build

@@ -101,7 +101,6 @@ def assert_clean_end(process: NodeProcess, number: signal.Signals, timeout: floa
         ({"renderer__sh_degree": 4, "map__path": "ROOM"}, "renderer.sh_degree"),
         ({"renderer__resolution_scale": 1.5, "map__path": "ROOM"}, "renderer.resolution_scale"),
         ({"localizer__max_passes": 0, "map__path": "ROOM"}, "localizer.max_passes"),
-        ({"localizer__max_reprojection_error": 3, "map__path": "ROOM"}, "expecting type 'DOUBLE'"),
     ],
 )
 def test_start_that_cannot_be_says_why_in_one_line(room_map_file, parameters, says):
