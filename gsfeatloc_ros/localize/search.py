@@ -243,8 +243,8 @@ def spread_poses(
         chosen.append(normal[farthest])
         distance = np.minimum(distance, np.linalg.norm(normal - normal[farthest], axis=1))
     chosen.sort(key=np.linalg.norm)
-    steps = [np.zeros(6)]
+    steps = np.zeros((1, 6))
     for step in (root @ point for point in chosen):
-        if min(np.linalg.norm((step - other) / min_step) for other in steps) >= 1:
-            steps.append(step)
+        if np.linalg.norm((step - steps) / min_step, axis=1).min() >= 1:
+            steps = np.vstack([steps, step])
     return [make_pose(so3_exp(step[3:]) @ T_map_camera[:3, :3], T_map_camera[:3, 3] + step[:3]) for step in steps[1:]]
