@@ -13,6 +13,7 @@ from gsfeatloc_ros.evaluate.dataset import PosedPhoto, Scene, read_image
 from gsfeatloc_ros.localize.engine import load_renderer
 from gsfeatloc_ros.localize.settings import MapSettings, RendererSettings
 from gsfeatloc_ros.maps import GaussianMap, load_map
+from gsfeatloc_ros.maps.files import iteration
 from gsfeatloc_ros.render import DrawOptions, Renderer, create_renderer
 
 # Of each kind, what its folder holds.
@@ -126,13 +127,7 @@ def _with_cameras_of_their_size(photos: Sequence[PosedPhoto]) -> Iterator[PosedP
 
 def _find_map(folder: Path) -> Path:
     for pattern in _MAPS:
-        found = sorted(folder.glob(pattern), key=_iteration)
+        found = sorted(folder.glob(pattern), key=iteration)
         if found:
             return found[-1]
     raise ValueError(f"{folder}: holds no map ({', '.join(_MAPS)}): say which one to use (--map)")
-
-
-def _iteration(path: Path) -> int:
-    """Return the number at the end of the name of the folder that a map is in, 0 if there is none."""
-    number = path.parent.name.rpartition("_")[2]
-    return int(number) if number.isdecimal() else 0

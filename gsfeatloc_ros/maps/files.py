@@ -26,10 +26,11 @@ def find_map(path: Path) -> Path:
         if (path / name).is_file():
             return path / name
     found = [*path.glob("point_cloud/iteration_*/point_cloud.ply"), *path.glob("iteration_*/point_cloud.ply")]
-    return max(found, key=_iteration, default=path)
+    return max(found, key=iteration, default=path)
 
 
-def _iteration(ply: Path) -> int:
+def iteration(ply: Path) -> int:
+    """Return the number of the iteration whose folder a map of the INRIA trainer is in, -1 if it is in none."""
     number = re.fullmatch(r"iteration_(\d+)", ply.parent.name)
     return int(number[1]) if number else -1
 

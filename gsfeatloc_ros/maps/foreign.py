@@ -30,10 +30,10 @@ _MAGICS: tuple[tuple[int, bytes, str], ...] = (
     (0, b"glTF", f"is a glTF (.glb): {_GLTF}"),
     (0, b"PXR-USDC", f"is a USD file: {_USD}"),
     (0, b"#usda", f"is a USD file: {_USD}"),
-    (0, b"\x80\x02", f"is a checkpoint or another pickle of Python: {_CHECKPOINT}"),
-    (0, b"\x80\x03", f"is a checkpoint or another pickle of Python: {_CHECKPOINT}"),
-    (0, b"\x80\x04", f"is a checkpoint or another pickle of Python: {_CHECKPOINT}"),
-    (0, b"\x80\x05", f"is a checkpoint or another pickle of Python: {_CHECKPOINT}"),
+    *(
+        (0, bytes([0x80, protocol]), f"is a checkpoint or another pickle of Python: {_CHECKPOINT}")
+        for protocol in range(2, 6)
+    ),
     (0, b"\x93NUMPY", f"is an array of numpy: {_NO_MAP}"),
     (0, b"\x89HDF\r\n\x1a\n", f"is an HDF5 file: {_NO_MAP}"),
     (0, b"\x89PNG\r\n\x1a\n", f"is a PNG image: {_NO_MAP}, for gsplat's PngCompression the folder of the images"),
@@ -60,7 +60,7 @@ _MAGICS: tuple[tuple[int, bytes, str], ...] = (
     (0, b"\x7fELF", f"is a program: {_NO_MAP}"),
     (0, b"MZ", f"is a program: {_NO_MAP}"),
     (0, b"gsfeatloc_ros prepared map", "is the cache of a map: name the map beside it"),
-    (0, b"gsfeatloc_ros index", "is the index of a map: name the map beside it"),
+    (0, b"gsfeatloc_ros view index", "is the index of a map: name the map beside it"),
     (0, b"<!DOCTYPE", "is a web page, not a map: was the download refused?"),
     (0, b"<html", "is a web page, not a map: was the download refused?"),
     (0, b"<?xml", f"is an XML file: {_NO_MAP}"),

@@ -23,8 +23,10 @@ from map_files import (
     write_streamed_sog,
 )
 from plyfile import PlyData, PlyElement
+from view_indices import made_up_index
 
 from gsfeatloc_ros.common.geometry import make_pose
+from gsfeatloc_ros.index.storage import save_index
 from gsfeatloc_ros.localize.localizer import Localizer
 from gsfeatloc_ros.localize.options import LocalizerOptions
 from gsfeatloc_ros.maps import GaussianMap, MapError, ReadOptions, Similarity, load_map
@@ -454,6 +456,17 @@ def test_a_file_of_others_is_named(tmp_path, name):
     with pytest.raises(MapError, match=match) as error:
         load_map(path)
     assert "damaged" not in str(error.value)
+
+
+def test_the_files_that_lie_beside_a_map_are_named(tmp_path):
+    """As they are written: a copy of how they begin would grow old."""
+    save_index(tmp_path / "index", made_up_index(views=2, features=3, dimension=64).index, {})
+    with pytest.raises(MapError, match="index of a map: name the map beside it"):
+        load_map(tmp_path / "index")
+    write_ply(tmp_path / "map.ply", sample_map(100, 0, 0))
+    load_prepared(tmp_path / "map.ply")
+    with pytest.raises(MapError, match="cache of a map: name the map beside it"):
+        load_map(tmp_path / "map.ply.gsfeatloc-cache")
 
 
 def test_folders_of_others_are_named(tmp_path):
