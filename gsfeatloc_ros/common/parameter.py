@@ -59,14 +59,22 @@ class Parameter:
         if isinstance(value, bool):
             value = self.as_set(value)
         if isinstance(value, list | tuple) and kind is tuple and all(type(item) in (int, float) for item in value):
-            return tuple(float(item) for item in value)
-        if kind is float and type(value) is int:
-            value = float(value)
+            return self.with_doubles(tuple(value))
+        if type(value) is int:
+            value = self.with_doubles(value)
         if type(value) is not kind:
             raise ValueError(f"parameter {self.name}: {value!r} is no {_KINDS[kind]}")
         if self.bounds and isinstance(value, int | float) and not self.bounds[0] <= value <= self.bounds[1]:
             raise ValueError(f"parameter {self.name}: {value} is not within {self.bounds[0]:g} and {self.bounds[1]:g}")
         self.check(value)
+        return value
+
+    def with_doubles(self, value: Any) -> Any:
+        """Return a number, or a tuple of numbers, as doubles where the parameter is of these; all else as it is."""
+        if isinstance(self.default, float) and type(value) is int:
+            return float(value)
+        if isinstance(self.default, tuple) and isinstance(value, tuple):
+            return tuple(float(item) for item in value)
         return value
 
     def check(self, value: Value) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from difflib import get_close_matches
 from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
@@ -15,7 +14,7 @@ from rclpy.parameter import Parameter as RosParameter
 
 from gsfeatloc_ros.common.parameter import Parameter
 from gsfeatloc_ros.common.words import in_one_line, shortened
-from gsfeatloc_ros.ros_io.settings import PARAMETERS, Settings
+from gsfeatloc_ros.ros_io.settings import PARAMETERS, Settings, nearest_name
 
 # Names that are accepted for one more release, though they have no effect, and what to set instead.
 _RETIRED = {
@@ -145,13 +144,11 @@ def with_lists_of_doubles(arguments: Sequence[str]) -> list[str]:
 
 def _as_declared(parameter: RosParameter) -> RosParameter:
     """Return a parameter with its integers as doubles where it is declared with these."""
-    declared, value = _BY_NAME.get(parameter.name), parameter.value
-    if declared is None:
-        return parameter
-    if isinstance(declared.default, float) and type(value) is int:
-        return RosParameter(parameter.name, value=float(value))
-    if isinstance(declared.default, tuple) and parameter.type_ is RosParameter.Type.INTEGER_ARRAY:
-        return RosParameter(parameter.name, value=[float(number) for number in value])
+    declared = _BY_NAME.get(parameter.name)
+    if declared is not None and parameter.type_ is RosParameter.Type.INTEGER:
+        return RosParameter(parameter.name, value=declared.with_doubles(parameter.value))
+    if declared is not None and parameter.type_ is RosParameter.Type.INTEGER_ARRAY:
+        return RosParameter(parameter.name, value=list(declared.with_doubles(tuple(parameter.value))))
     return parameter
 
 
@@ -160,6 +157,6 @@ def _warn_of_retired(node: Node, name: str) -> None:
 
 
 def _warn_of_unknown(node: Node, name: str) -> None:
-    near = get_close_matches(name, _BY_NAME, n=1)
-    advice = f"is it {near[0]}?" if near else "docs/parameters.md has them all"
+    near = nearest_name(name)
+    advice = f"is it {near}?" if near else "docs/parameters.md has them all"
     node.get_logger().warning(f"parameter {name} is none of this node's, and has no effect: {advice}")

@@ -7,12 +7,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-import yaml
 
+from gsfeatloc_ros.common.yaml_file import read_yaml
 from gsfeatloc_ros.ros_io.message_types import Header, RegionOfInterest, Time
-
-# Of the file: no calibration is larger.
-_MAX_BYTES = 1_000_000
 
 
 @dataclass
@@ -60,8 +57,7 @@ def read_calibration(path: Path) -> FileCameraInfo:
         ValueError: the file cannot be read, or is none; the message says why.
     """
     try:
-        with path.open("rb") as file:
-            content = yaml.safe_load(file.read(_MAX_BYTES))
+        content = read_yaml(path)
         if not isinstance(content, dict):
             raise ValueError("it is no mapping")
         return FileCameraInfo(
@@ -79,7 +75,7 @@ def read_calibration(path: Path) -> FileCameraInfo:
         raise ValueError(
             f"{path}: lacks the key {error}: a calibration as camera_calibration writes it is expected"
         ) from error
-    except (yaml.YAMLError, TypeError, ValueError, OverflowError, RecursionError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         reason = " ".join(str(error).split())
         raise ValueError(f"{path}: is no calibration as camera_calibration writes it: {reason}") from error
 

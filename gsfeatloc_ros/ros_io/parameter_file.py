@@ -8,9 +8,9 @@ from typing import Any
 
 import yaml
 
+from gsfeatloc_ros.common.yaml_file import read_yaml
+
 NODE = "localizer"
-# Of the file: none that people write is larger.
-_MAX_BYTES = 1_000_000
 _KEY = "ros__parameters"
 
 
@@ -21,12 +21,11 @@ def read_parameter_file(path: Path) -> dict[str, Any]:
         ValueError: the file cannot be read, or has none of these; the message says why.
     """
     try:
-        with path.open("rb") as file:
-            content = yaml.safe_load(file.read(_MAX_BYTES))
+        content = read_yaml(path)
     except OSError as error:
         raise ValueError(f"{path}: cannot be read: {error.strerror}") from error
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise ValueError(f"{path}: is no YAML: {' '.join(str(error).split())}") from error
+    except ValueError as error:
+        raise ValueError(f"{path}: is no YAML: {error}") from error
     values: dict[str, Any] = {}
     found = False
     for node, parameters in _sections(content):

@@ -216,8 +216,8 @@ class Settings:
             if name in known:
                 converted[name] = known[name].converted(value)
             elif not name.startswith(_OF_ROS):
-                near = difflib.get_close_matches(name, known, 1)
-                raise ValueError(f"there is no parameter {name}{f': is {near[0]} meant?' if near else ''}")
+                near = nearest_name(name)
+                raise ValueError(f"there is no parameter {name}{f': is {near} meant?' if near else ''}")
         return Settings.of(converted)
 
 
@@ -257,3 +257,8 @@ def _place(parameter: Parameter) -> int:
 PARAMETERS = tuple(
     sorted((item for prefix, group in _GROUPS.items() for item in parameters_of(group, prefix)), key=_place)
 )
+
+
+def nearest_name(name: str) -> str:
+    """Return the parameter whose name is most like another name; empty where none is like it."""
+    return next(iter(difflib.get_close_matches(name, [item.name for item in PARAMETERS], n=1)), "")

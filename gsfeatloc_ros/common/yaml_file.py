@@ -1,0 +1,25 @@
+"""YAML files that people or tools wrote."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+# Of a file: no calibration, and nothing that people write, is larger.
+_MAX_BYTES = 1_000_000
+
+
+def read_yaml(path: Path) -> Any:
+    """Read a YAML file; of one of more than a megabyte its beginning.
+
+    Raises:
+        ValueError: it is no YAML; the message says why, in one line.
+        OSError: it cannot be read.
+    """
+    try:
+        with path.open("rb") as file:
+            return yaml.safe_load(file.read(_MAX_BYTES))
+    except (yaml.YAMLError, RecursionError) as error:
+        raise ValueError(" ".join(str(error).split())) from error
