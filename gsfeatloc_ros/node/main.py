@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import sys
-import threading
 import time
 from typing import TYPE_CHECKING
 
 from gsfeatloc_ros.common.threads import wait_passively
 from gsfeatloc_ros.common.words import in_one_line
 from gsfeatloc_ros.node.environment import check_environment
+from gsfeatloc_ros.node.loading import is_loading
 from gsfeatloc_ros.node.stop import Stop, leave
 from gsfeatloc_ros.node.systemd import Systemd
 
@@ -91,7 +91,7 @@ def _end(node: LocalizerNode, executor: GuardedExecutor) -> None:
         executor.spin_once(_PERIOD)
     node.destroy_node()
     rclpy.shutdown()
-    if any(thread.name == "loader" for thread in threading.enumerate()):
+    if is_loading():
         leave(0)
 
 

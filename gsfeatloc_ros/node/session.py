@@ -35,8 +35,8 @@ class Session:
     """Localizes the newest image with the newest prior, and what services ask for before that.
 
     Messages are received in the executor's thread. One worker thread decodes and localizes. An image is paired with the
-    camera_info and the prior that are the newest when the work on it starts; if one is missing then, the image is
-    refused and not tried again when it comes.
+    camera_info and the prior that are the newest when the work on it starts, a requested one with those of its request;
+    if one is missing then, the image is refused and not tried again when it comes.
 
     Args:
         node: whose topics they are.
