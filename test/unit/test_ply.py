@@ -39,13 +39,16 @@ def save(path, values, dtype="f4", text=False, byte_order="<"):
 
 
 def random_map(count: int, degree: int, seed: int) -> GaussianMap:
+    """Of any Gaussians, the first of which can be seen: a map without one is refused."""
     rng = np.random.default_rng(seed)
     rotations = rng.normal(size=(count, 4))
+    opacities = rng.uniform(0, 1, count).astype(np.float32)
+    opacities[:1] = 0.5 + 0.5 * opacities[:1]
     return GaussianMap(
         means=rng.normal(0, 10, (count, 3)).astype(np.float32),
         scales=np.exp(rng.normal(-3, 2, (count, 3))).astype(np.float32),
         rotations=(rotations / np.linalg.norm(rotations, axis=1, keepdims=True)).astype(np.float32),
-        opacities=rng.uniform(0, 1, count).astype(np.float32),
+        opacities=opacities,
         sh=rng.normal(0, 1, (count, (degree + 1) ** 2, 3)).astype(np.float32),
     )
 
