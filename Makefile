@@ -1,7 +1,7 @@
 # Every target does its own set-up (scripts/setup.sh).
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
-.PHONY: help demo test nightly unit node real gpu gsplat fuzz lint build setup clean
+.PHONY: help demo test nightly unit node real gpu gsplat fuzz lint build setup lock sbom audit clean
 
 help:
 	@echo "make demo   localize a camera in a made-up room, from start to end"
@@ -15,6 +15,9 @@ help:
 	@echo "make fuzz   feed damaged files and messages to what reads them, for ten minutes"
 	@echo "make lint   check the style and the types of the code"
 	@echo "make build  build with colcon, into install/"
+	@echo "make lock   make locks/ fit setup.py; with ARGS=--upgrade, to the newest versions"
+	@echo "make sbom   list what is installed, in sbom/"
+	@echo "make audit  ask what is known against what is in locks/"
 	@echo "make clean  remove what the others made, but for .venv"
 
 demo: build
@@ -59,5 +62,22 @@ build: setup
 setup:
 	@scripts/setup.sh
 
+# Tools apart from .venv, which has only what is tested.
+.tools: locks/tools.txt | setup
+	@.venv/bin/python -m venv --clear .tools
+	@.tools/bin/python -m pip --disable-pip-version-check install --quiet --no-deps --only-binary :all: --require-hashes --requirement locks/tools.txt
+	@touch .tools
+
+lock: .tools
+	@scripts/lock.sh $(ARGS)
+
+sbom: .tools
+	@mkdir -p sbom
+	.tools/bin/cyclonedx-py environment .venv --output-reproducible --output-file sbom/venv.json
+	.tools/bin/cyclonedx-py requirements locks/container.txt --output-reproducible --output-file sbom/container.json
+
+audit: .tools
+	@.venv/bin/python scripts/audit.py
+
 clean:
-	rm -rf build install log demo_output .pytest_cache .ruff_cache .mypy_cache .hypothesis
+	rm -rf build install log demo_output sbom .pytest_cache .ruff_cache .mypy_cache .hypothesis

