@@ -57,15 +57,17 @@ class FeatureTracker:
 
     def __init__(self, matcher: Matcher, photo: Photo, device: str) -> None:
         self._matcher = matcher
-        self.corners = matcher.features(photo.image)
+        self._features = matcher.features(photo.image)
+        # Dense features have no pixels of their own.
+        self.corners = create_tracker(photo, device).corners
 
     def track(self, image: Array) -> Matches:
         """Find the photo's features in a render (H, W, 3) uint8 RGB."""
-        return self._matcher.match(self.corners, self._matcher.features(image))
+        return self._matcher.match(self._features, self._matcher.features(image))
 
     def track_back(self, image: Array) -> Matches:
         """Find the features of a render in the photo."""
-        return self._matcher.match(self._matcher.features(image), self.corners).swapped()
+        return self._matcher.match(self._matcher.features(image), self._features).swapped()
 
 
 class WholePixelTracker:

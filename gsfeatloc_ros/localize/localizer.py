@@ -18,6 +18,7 @@ from gsfeatloc_ros.common.stage_clock import StageClock
 from gsfeatloc_ros.index import ViewIndex
 from gsfeatloc_ros.localize.blur import estimate_blur
 from gsfeatloc_ros.localize.comparison import changed_mask, compare, preference
+from gsfeatloc_ros.localize.content import too_little
 from gsfeatloc_ros.localize.estimate import Estimate, Status, Trace
 from gsfeatloc_ros.localize.evidence import (
     Evidence,
@@ -31,7 +32,7 @@ from gsfeatloc_ros.localize.evidence import (
 from gsfeatloc_ros.localize.options import LocalizerOptions
 from gsfeatloc_ros.localize.prior import Prior
 from gsfeatloc_ros.localize.query import Components, MatchedView, Query
-from gsfeatloc_ros.localize.search import MIN_HINT, SEARCH_WIDTH, Search
+from gsfeatloc_ros.localize.search import SEARCH_WIDTH, Search
 from gsfeatloc_ros.maps.gaussian_map import Reading
 from gsfeatloc_ros.match import Matcher, Tracker, create_tracker
 from gsfeatloc_ros.pose.camera_fit import CameraFit, fit_camera
@@ -138,11 +139,9 @@ class Localizer:
 
     def _search(self, query: Query, prior: Prior | None) -> Trace:
         """Match small views of the map, first at the prior, then where else it may be, and refine what they suggest."""
-        with query.clock.stage("features"):
-            small = query.limited(SEARCH_WIDTH)
-            features = len(small.features)
-        if features < MIN_HINT:
-            reason = f"{features} features in the photo: is it too dark, too bright or out of focus?"
+        small = query.limited(SEARCH_WIDTH)
+        reason = too_little(query, small)
+        if reason:
             return Trace(Estimate(Status.FAILED, reason), query.photo)
         search = Search(small, prior, self._now)
         rejected: _Candidate | None = None
@@ -160,7 +159,7 @@ class Localizer:
             rejected = rejected or candidate
         if rejected is not None:
             return rejected.trace(query.photo, search)
-        return _nothing_in_common(query.photo, features, search, self._components.renderer.reading)
+        return _nothing_in_common(query.photo, len(small.features), search, self._components.renderer.reading)
 
     def _best(
         self, query: Query, found: _Candidate, search: Search, prior: Prior | None

@@ -114,7 +114,7 @@ class Query:
 
     @cached_property
     def tracker(self) -> Tracker:
-        """The tracker of the photo's corners; made when there is an estimate to track from."""
+        """The tracker of the photo's corners."""
         with self.clock.stage("track"):
             return self.components.create_tracker(self.photo, self.components.renderer.device)
 

@@ -73,11 +73,11 @@ class Tracker(Protocol):
     """Finds the corners of one photo in renders of nearly the same view.
 
     Attributes:
-        corners: of the photo; others look at nothing but their number.
+        corners: (N, 2) pixels of the photo.
     """
 
     @property
-    def corners(self) -> Sized: ...
+    def corners(self) -> np.ndarray: ...
 
     def track(self, image: Array) -> Matches:
         """Find the photo's corners in a render (H, W, 3) uint8 RGB of its size; those that cannot be are left out."""
