@@ -14,7 +14,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-# Pixels. As many no robot's camera has; as RGB they take 150 MB.
+# Pixels. As many no robot's camera has; as RGB they take 150 MB, of 16 bits 300 MB.
 MAX_PIXELS = 50_000_000
 # Those of cameras and phones have about 20, with EXIF, a thumbnail and a colour profile.
 _MAX_JPEG_SEGMENTS = 200
@@ -29,6 +29,30 @@ _PNG_START = b"\x89PNG\r\n\x1a\n"
 # Red, green, blue and alpha of 16 bits; palette, frames of chunks and of what does not compress.
 _MAX_PNG_PIXEL_BYTES, _MAX_PNG_OVERHEAD = 9, 65536
 _PNG_CHUNKS = (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND")
+# What else images are sent as, by place and bytes.
+_OTHER_KINDS = (
+    (8, b"WEBP", "WebP"),
+    (0, b"\0\0\0\1", "video (H.264, H.265)"),
+    (0, b"\0\0\1", "video (H.264, H.265, MPEG)"),
+    (0, b"OggS", "video (Theora)"),
+    (0, b"\x1aE\xdf\xa3", "video (Matroska, WebM)"),
+    (4, b"ftypavif", "AVIF"),
+    (4, b"ftypheic", "HEIC"),
+    (4, b"ftyp", "video (MP4)"),
+    (0, b"II*\0", "TIFF"),
+    (0, b"MM\0*", "TIFF"),
+    (0, b"\0\0\0\x0cjP", "JPEG 2000"),
+    (0, b"\xff\x4f\xff\x51", "JPEG 2000"),
+    (0, b"\0\0\0\x0cJXL", "JPEG XL"),
+    (0, b"\xff\x0a", "JPEG XL"),
+    (0, b"\x28\xb5\x2f\xfd", "packed by Zstandard"),
+    (0, b"\x1f\x8b", "packed by gzip"),
+    (0, b"GIF8", "GIF"),
+    (0, b"BM", "BMP"),
+    (0, b"qoif", "QOI"),
+    # Behind the parameters of compressed_depth_image_transport.
+    (12, _PNG_START, "a depth image (compressedDepth)"),
+)
 
 
 class Picture(NamedTuple):
@@ -37,11 +61,13 @@ class Picture(NamedTuple):
     Attributes:
         width, height: in pixels.
         data: that the decoder is to see.
+        bits: of a sample when it is decoded, 8 or 16.
     """
 
     width: int
     height: int
     data: bytes
+    bits: int = 8
 
 
 def read_header(data: bytes) -> Picture:
@@ -55,7 +81,8 @@ def read_header(data: bytes) -> Picture:
     elif data.startswith(_PNG_START):
         picture = _read_png(data)
     else:
-        raise ValueError("is no JPEG or PNG")
+        kind = next((kind for place, start, kind in _OTHER_KINDS if data[place:].startswith(start)), "")
+        raise ValueError(f"is {kind}, no JPEG or PNG" if kind else "is no JPEG or PNG")
     width, height = picture.width, picture.height
     if width * height == 0:
         raise ValueError("has no pixels")
@@ -65,16 +92,17 @@ def read_header(data: bytes) -> Picture:
 
 
 def decode(picture: Picture) -> np.ndarray:
-    """Return the pixels (H, W, 3) uint8 RGB; an alpha channel is dropped, an orientation that EXIF tells ignored.
+    """Return the pixels (H, W, 3) RGB, uint8 or uint16; alpha is dropped, an orientation that EXIF tells ignored.
 
     Raises:
         ValueError: the picture is damaged.
     """
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     try:
-        bgr = cv2.imdecode(np.frombuffer(picture.data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+        bgr = cv2.imdecode(np.frombuffer(picture.data, np.uint8), flags)
     except cv2.error as error:
         raise ValueError(f"cannot be decoded: {error.err}") from error
-    if bgr is None or bgr.shape[:2] != (picture.height, picture.width):
+    if bgr is None or bgr.shape[:2] != (picture.height, picture.width) or 8 * bgr.itemsize != picture.bits:
         raise ValueError("is damaged")
     return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
 
@@ -89,6 +117,8 @@ def _read_jpeg(data: bytes) -> Picture:
         if marker == _JPEG_SCAN and size is not None:
             return Picture(*size, data)
         if marker in _JPEG_FRAMES and size is None and len(segment) >= 5:
+            if segment[0] != 8:
+                raise ValueError(f"is a JPEG of {segment[0]} bits, those of 8 are decoded")
             size = int.from_bytes(segment[3:5], "big"), int.from_bytes(segment[1:3], "big")
         elif marker not in _JPEG_OTHERS:
             raise ValueError(f"is a damaged JPEG, or of a kind that is not decoded (marker {marker:02X})")
@@ -120,7 +150,8 @@ def _read_png(data: bytes) -> Picture:
         if kind in _PNG_CHUNKS:
             kept.append(data[place:end])
         place = end
-    picture = Picture(int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big"), b"".join(kept))
+    width, height, depth = int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big"), data[24:25]
+    picture = Picture(width, height, b"".join(kept), bits=16 if depth == b"\x10" else 8)
     # What does not compress stays as large as it is; of more all is unpacked in vain, a thousand times as much.
     if len(picture.data) > _MAX_PNG_OVERHEAD + _MAX_PNG_PIXEL_BYTES * picture.width * picture.height:
         raise ValueError(f"is a PNG of {picture.width}x{picture.height} pixels that holds more than these")

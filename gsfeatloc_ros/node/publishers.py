@@ -20,8 +20,9 @@ from gsfeatloc_ros.node.encode import image_message, pose_array_message, pose_me
 from gsfeatloc_ros.node.interfaces import ProtectionLevelMessage
 from gsfeatloc_ros.node.qos import LATCHED, RELIABLE, overridable
 from gsfeatloc_ros.node.transforms import Transforms
+from gsfeatloc_ros.ros_io.compressed_image import PictureError
 from gsfeatloc_ros.ros_io.debug_picture import draw, draw_refused
-from gsfeatloc_ros.ros_io.decode import PictureError, nanoseconds
+from gsfeatloc_ros.ros_io.decode import nanoseconds
 from gsfeatloc_ros.ros_io.extrinsics import Extrinsics
 from gsfeatloc_ros.ros_io.pictures import PictureReader
 from gsfeatloc_ros.ros_io.settings import Settings

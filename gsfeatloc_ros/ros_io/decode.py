@@ -1,8 +1,8 @@
-"""Decode ROS messages into the localizer's own types: here poses and compressed images.
+"""Decode ROS messages into the localizer's own types: here poses.
 
-Raw images are decoded in raw_image.py, calibrations in calibration.py. Everything that comes from outside is checked in
-these three and nowhere else: a message that cannot be used raises ValueError, which says what is wrong and what to do
-about it.
+Images are decoded in raw_image.py and compressed_image.py, calibrations in calibration.py. Everything that comes from
+outside is checked in these four and nowhere else: a message that cannot be used raises ValueError, which says what is
+wrong and what to do about it.
 """
 
 from __future__ import annotations
@@ -10,61 +10,10 @@ from __future__ import annotations
 import numpy as np
 
 from gsfeatloc_ros.common.geometry import make_pose, matrix_from_quaternion
-from gsfeatloc_ros.common.jpeg_png import decode, read_header
-from gsfeatloc_ros.ros_io.message_types import (
-    AnyImage,
-    AnyPose,
-    CompressedImage,
-    Odometry,
-    PoseWithCovariance,
-    Time,
-)
+from gsfeatloc_ros.ros_io.message_types import AnyPose, Odometry, PoseWithCovariance, Time
 
 # Of a prior, in m^2 or rad^2; a larger one says nothing, and products of it overflow.
 _MAX_VARIANCE = 1e12
-
-
-class PictureError(ValueError):
-    """The picture of an image message cannot be used, or is of another size than its camera's."""
-
-
-def decode_compressed_image(message: CompressedImage) -> np.ndarray:
-    """Return the pixels (H, W, 3) uint8 RGB of a JPEG or PNG image, grey or in colour; an alpha channel is dropped.
-
-    Raises:
-        PictureError: see picture_size; or a depth image, or the raw pattern of a Bayer filter.
-    """
-    encoding, _, compression = message.format.partition(";")
-    if "compressedDepth" in message.format:
-        raise PictureError(f"image of format {message.format!r} is a depth image: take the topic of the pictures")
-    if encoding.startswith("bayer") and not compression.strip().endswith(("bgr8", "rgb8")):
-        raise PictureError(
-            f"image of format {message.format!r} has no colours yet: take the topic of the colour images"
-        )
-    try:
-        return decode(read_header(bytes(message.data)))
-    except ValueError as error:
-        raise PictureError(f"{_named(message)} {error}") from error
-
-
-def picture_size(message: AnyImage) -> tuple[int, int]:
-    """Return the width and height of the picture in an image message of either type, without decoding it.
-
-    Raises:
-        PictureError: no JPEG or PNG, a damaged one, or one that takes more than any camera's: a few bytes can hold
-            gigabytes.
-    """
-    if not isinstance(message, CompressedImage):
-        return message.width, message.height
-    try:
-        picture = read_header(bytes(message.data))
-    except ValueError as error:
-        raise PictureError(f"{_named(message)} {error}") from error
-    return picture.width, picture.height
-
-
-def _named(message: CompressedImage) -> str:
-    return f"image of format {message.format!r}, {len(message.data)} bytes,"
 
 
 def decode_pose(message: AnyPose | Odometry, name: str) -> np.ndarray:

@@ -13,7 +13,8 @@ import numpy as np
 from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.geometry import invert, rotate_covariance, shift_covariance
 from gsfeatloc_ros.ros_io.calibration import decode_camera
-from gsfeatloc_ros.ros_io.decode import PictureError, decode_pose, frame_name, nanoseconds, picture_size
+from gsfeatloc_ros.ros_io.compressed_image import PictureError
+from gsfeatloc_ros.ros_io.decode import decode_pose, frame_name, nanoseconds
 from gsfeatloc_ros.ros_io.growth import Growth, Travelled, position_sigma
 from gsfeatloc_ros.ros_io.message_types import AnyImage
 from gsfeatloc_ros.ros_io.message_types import Odometry as OdometryMessage
@@ -272,16 +273,16 @@ class Inputs:
         if prior is None and newest.problem:
             raise ValueError(newest.problem)
         prior = prior or newest.value or (self.policy.plane() if self.policy.planar else None)
-        width, height = picture_size(message)
-        if (camera.width, camera.height) != (width, height):
+        picture = self._pictures.open(message)
+        if (camera.width, camera.height) != (picture.width, picture.height):
             raise PictureError(
-                f"camera_info is for {camera.width}x{camera.height} but the image is {width}x{height}: use the "
-                "camera_info of this image"
+                f"camera_info is for {camera.width}x{camera.height} but the image is {picture.width}x{picture.height}: "
+                "use the camera_info of this image"
             )
         stamp, frame = nanoseconds(message.header.stamp), frame_name(message.header.frame_id)
         pose, covariance = (None, None) if prior is None else self._at(prior, stamp, frame)
-        camera = replace(camera, readout=self._readout(stamp, frame, height))
-        return LocalizerInput(self._pictures.decode(message), camera, pose, covariance, prior, newest.value)
+        camera = replace(camera, readout=self._readout(stamp, frame, picture.height))
+        return LocalizerInput(picture.decode(), camera, pose, covariance, prior, newest.value)
 
     def _set_prior(self, newest: _Newest[Prior]) -> None:
         with self._prior_lock:

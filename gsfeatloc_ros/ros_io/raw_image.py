@@ -140,20 +140,25 @@ def decode_image(message: Image, bits: int = 16) -> np.ndarray:
         chroma = chroma.reshape(message.height, message.width, 2)[::2, ::2]
         pixels = np.vstack([brightness, chroma.reshape(-1, message.width)])
     if encoding.bits == 16:
-        pixels = cv2.convertScaleAbs(pixels, alpha=255.0 / (2**bits - 1))
+        pixels = in_8_bits(pixels, bits)
     if encoding.channels > 1:
         pixels = pixels.reshape(message.height, message.width, encoding.channels)
     return pixels if encoding.conversion is None else cv2.cvtColor(pixels, encoding.conversion)
 
 
-def needed_bits(message: Image) -> int:
-    """Return how many bits the samples of an image need, one of SAMPLE_BITS.
+def largest_sample(message: Image) -> int:
+    """Return the largest value in an image; raise ValueError as validate_image does."""
+    return int(_samples(message).max())
 
-    Raises:
-        ValueError: see validate_image.
-    """
-    largest = int(_samples(message).max())
+
+def needed_bits(largest: int) -> int:
+    """Return how many bits samples up to the largest need, one of SAMPLE_BITS."""
     return next(bits for bits in SAMPLE_BITS if largest < 2**bits)
+
+
+def in_8_bits(samples: np.ndarray, bits: int) -> np.ndarray:
+    """Return samples uint16 as uint8: the largest number of so many bits becomes 255."""
+    return cv2.convertScaleAbs(samples, alpha=255.0 / (2**bits - 1))
 
 
 def _samples(message: Image) -> np.ndarray:

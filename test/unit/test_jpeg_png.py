@@ -102,6 +102,13 @@ def test_what_is_no_pixel_of_a_png_is_not_given_to_the_decoder(kind):
 
 
 @pytest.mark.usefixtures("no_decoder")
+def test_a_jpeg_of_12_bits_is_named():
+    precision = JPEG.index(b"\xff\xc0") + 4
+    with pytest.raises(ValueError, match="JPEG of 12 bits"):
+        read_header(JPEG[:precision] + b"\x0c" + JPEG[precision + 1 :])
+
+
+@pytest.mark.usefixtures("no_decoder")
 def test_a_png_that_holds_more_than_its_pixels_is_refused():
     """All of it would be unpacked: gigabytes."""
     with pytest.raises(ValueError, match="64x48 pixels that holds more"):

@@ -40,11 +40,10 @@ from gsfeatloc_ros.render import create_renderer
 from gsfeatloc_ros.replay.bag import Role, open_bag
 from gsfeatloc_ros.replay.run import Replay
 from gsfeatloc_ros.replay.truth import MAX_GAP, Trajectory
-from gsfeatloc_ros.ros_io.decode import decode_compressed_image, decode_covariance
+from gsfeatloc_ros.ros_io.decode import decode_covariance
 from gsfeatloc_ros.ros_io.outcome import OutcomeStatus
 from gsfeatloc_ros.ros_io.settings import Settings
 from gsfeatloc_ros.simulate import write_bag
-from gsfeatloc_ros.simulate.bag_messages import header, make
 from gsfeatloc_ros.tools.replay import NOTHING_LOCALIZED, main
 
 storages = pytest.mark.parametrize(
@@ -414,29 +413,6 @@ def test_truth_that_is_not_known():
     apart = Trajectory([(0, np.eye(4)), (gap, np.eye(4))])
     assert apart.at(1) is None
     assert apart.at(gap) is not None
-
-
-def test_compressed_images_that_cannot_be_used():
-    def message(data: bytes, form: str) -> object:
-        return make("sensor_msgs/msg/CompressedImage", header(0.0, "camera"), form, np.frombuffer(data, np.uint8))
-
-    png = cv2.imencode(".png", SMALL)[1].tobytes()
-    for data in (b"", b"\xff\xd8\xff", png[: len(png) // 2]):
-        with pytest.raises(ValueError, match=r"format 'jpeg'"):
-            decode_compressed_image(message(data, "jpeg"))
-    with pytest.raises(ValueError, match="depth image"):
-        decode_compressed_image(message(bytes(12) + png, "16UC1; compressedDepth png"))
-    with pytest.raises(ValueError, match="no colours"):
-        decode_compressed_image(message(png, "bayer_rggb8; png compressed "))
-
-
-@given(st.integers(0, 255), st.integers(0, 255), st.integers(0, 255), st.sampled_from([".png", ".jpg"]))
-@unhurried
-def test_compressed_images_keep_their_colour(red, green, blue, suffix):
-    rgb = np.full((16, 24, 3), [red, green, blue], np.uint8)
-    decoded = decode_compressed_image(compressed_image(0.0, rgb, suffix, suffix[1:]))
-    assert decoded.shape == rgb.shape
-    assert np.abs(decoded.astype(int) - rgb).max() <= (0 if suffix == ".png" else 4)
 
 
 def test_covariance_of_a_prior():
