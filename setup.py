@@ -1,3 +1,4 @@
+import sys
 from glob import glob
 
 from setuptools import find_packages, setup
@@ -12,6 +13,11 @@ evaluate = [
     "pycolmap>=4.0,<5",  # the first that adds an image with its pose in one step
 ]
 superpoint = ["transformers>=5.0,<6"]
+
+# What `ros2 run gsfeatloc_ros NAME` finds, where colcon or bloom installs. A wheel would put names as common as `index`
+# into a user's bin: there they are subcommands of gsfeatloc alone.
+tools = ["benchmark", "demo", "evaluate", "index", "negatives", "parameters", "replay", "soak", "warmup"]
+for_ros = {"install", "develop"} & set(sys.argv)
 
 setup(
     name=package_name,
@@ -28,10 +34,17 @@ setup(
         (f"share/{package_name}/config", glob("config/*")),
         (f"share/{package_name}/launch", glob("launch/*.launch.py")),
     ],
-    entry_points={"console_scripts": ["localizer = gsfeatloc_ros.node.main:main"]},
+    entry_points={
+        "console_scripts": [
+            "gsfeatloc = gsfeatloc_ros.tools.command:main",
+            "localizer = gsfeatloc_ros.node.main:main",
+            *(f"{name} = gsfeatloc_ros.tools.{name}:main" for name in tools if for_ros),
+        ]
+    },
     zip_safe=True,
     python_requires=">=3.11,<3.13",
     install_requires=[
+        "argcomplete>=3.1,<4",  # completes the words of gsfeatloc in a shell
         "backports.zstd>=1.0,<2",  # .spz of version 4; in the standard library from Python 3.14 on
         "faiss-cpu>=1.9,<2",  # nearest neighbours among the features of an index of views
         "kornia>=0.9,<0.10",  # the first whose LoFTR gives an image's features apart

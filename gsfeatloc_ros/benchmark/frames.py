@@ -45,8 +45,6 @@ def measure_map(
     Raises:
         ValueError, OSError: the map or the device cannot be used.
     """
-    warm_up(device=settings.device, threads=settings.threads)
-    renderer, cold = _measure_load(lambda: _create_renderer(load_map(path), settings))
     gaussian_map = load_map(path)
     if pose is None:
         pose = view_of_all(gaussian_map)
@@ -57,6 +55,8 @@ def measure_map(
         "parameters_mb": sum(v.nbytes for v in vars(gaussian_map).values() if isinstance(v, np.ndarray)) / 2**20,
     }
     del gaussian_map
+    warm_up(device=settings.device, threads=settings.threads)
+    renderer, cold = _measure_load(lambda: _create_renderer(load_map(path), settings))
     report |= measure_frames(renderer, pinhole(size), [pose] * frames)
     del renderer
     with tempfile.TemporaryDirectory() as folder:

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from signal import SIGINT, Signals
 
-from ament_index_python.packages import get_package_prefix, get_package_share_directory
+from ament_index_python.packages import PackageNotFoundError, get_package_prefix, get_package_share_directory
 
 # What the localizer writes when images need no prior any more.
 INDEX_READY = "the view index is ready"
@@ -30,7 +30,7 @@ def executable() -> Path:
 
 def node_arguments(parameters: Mapping[str, object], remappings: Mapping[str, str] | None = None) -> list[str]:
     """Return the command line that sets config/localizer.yaml, then `parameters`, and remaps names."""
-    defaults = Path(get_package_share_directory("gsfeatloc_ros")) / "config" / "localizer.yaml"
+    defaults = _config_folder() / "localizer.yaml"
     arguments = ["--ros-args", "--params-file", str(defaults)]
     for name, value in parameters.items():
         arguments += ["-p", f"{name}:={value}"]
@@ -40,11 +40,21 @@ def node_arguments(parameters: Mapping[str, object], remappings: Mapping[str, st
 
 
 def isolate_ros() -> None:
-    """Let this process and its children talk to each other over ROS and to nobody else, large images included."""
+    """Let this process and its children talk to each other over ROS and to nobody else, large images included.
+
+    Raises:
+        RuntimeError: the package is not installed where ROS looks.
+    """
     os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-    profile = Path(get_package_share_directory("gsfeatloc_ros")) / "config" / "fastdds.xml"
-    os.environ.setdefault("FASTRTPS_DEFAULT_PROFILES_FILE", str(profile))
+    os.environ.setdefault("FASTRTPS_DEFAULT_PROFILES_FILE", str(_config_folder() / "fastdds.xml"))
+
+
+def _config_folder() -> Path:
+    try:
+        return Path(get_package_share_directory("gsfeatloc_ros")) / "config"
+    except PackageNotFoundError as error:
+        raise RuntimeError("gsfeatloc_ros is not installed where ROS looks: source its install/setup.bash") from error
 
 
 class LocalizerProcess:

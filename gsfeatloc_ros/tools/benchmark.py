@@ -1,14 +1,14 @@
 """Measure the parts that decide how fast and how right an answer is.
 
-    python -m gsfeatloc_ros.tools.benchmark synthetic --gaussians 1000000 --out map.ply
-    python -m gsfeatloc_ros.tools.benchmark render --map map.ply --size 640x480 --json frames.json
-    python -m gsfeatloc_ros.tools.benchmark render --scene SCENE
-    python -m gsfeatloc_ros.tools.benchmark opensplat --map map.ply --checkout OpenSplat
-    python -m gsfeatloc_ros.tools.benchmark query --scene SCENE --matcher xfeat --json query.json
-    python -m gsfeatloc_ros.tools.benchmark scaling --out scaling.png
-    python -m gsfeatloc_ros.tools.benchmark index --out index.png
-    python -m gsfeatloc_ros.tools.benchmark twins --share 0,0.02 --photos 200
-    python -m gsfeatloc_ros.tools.benchmark pnp
+    gsfeatloc benchmark synthetic --gaussians 1000000 --out map.ply
+    gsfeatloc benchmark render --map map.ply --size 640x480 --json frames.json
+    gsfeatloc benchmark render --scene SCENE
+    gsfeatloc benchmark opensplat --map map.ply --checkout OpenSplat
+    gsfeatloc benchmark query --scene SCENE --matcher xfeat --json query.json
+    gsfeatloc benchmark scaling --out scaling.png
+    gsfeatloc benchmark index --out index.png
+    gsfeatloc benchmark twins --share 0,0.02 --photos 200
+    gsfeatloc benchmark pnp
 
 CPU milliseconds count all threads; on a shared machine they, and ratios within one run, mean more than wall time.
 """
@@ -39,21 +39,25 @@ from gsfeatloc_ros.match import DEFAULT_MATCHER, MATCHERS
 from gsfeatloc_ros.render import DEVICES
 from gsfeatloc_ros.simulate.two_rooms import VIEWS, two_rooms
 from gsfeatloc_ros.tools.options import add_old_name, number
+from gsfeatloc_ros.tools.status import run_tool
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command line; return the exit status."""
-    options = _parser().parse_args(arguments)
-    try:
+    """Run the command line; return the exit status: 0, or 2 where something cannot be used."""
+    options = make_parser().parse_args(arguments)
+
+    def run() -> int:
         options.run(options)
-    except (ValueError, OSError, RuntimeError) as error:
-        print(f"benchmark: {error}", file=sys.stderr)
-        return 1
-    return 0
+        return 0
+
+    return run_tool("benchmark", run)
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def make_parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    parser = argparse.ArgumentParser(
+        prog="gsfeatloc benchmark", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     commands = parser.add_subparsers(dest="command", required=True)
     device = argparse.ArgumentParser(add_help=False)
     device.add_argument("--device", choices=DEVICES, default="auto", help="to render on (default: %(default)s)")
@@ -196,7 +200,7 @@ def _synthetic(options: argparse.Namespace) -> None:
     for name, pose in VIEWS.items():
         numbers = [*pose[:3, 3], *quaternion_from_matrix(pose[:3, :3])]
         words = " ".join(f"{number:.4g}" for number in numbers)
-        print(f"  {name:10}  benchmark render --map {options.out} --pose {words}")
+        print(f"  {name:10}  gsfeatloc benchmark render --map {options.out} --pose {words}")
 
 
 def _scaling(options: argparse.Namespace) -> None:

@@ -5,7 +5,7 @@ the bag into it, and compares its answers with the truth. Then the camera is kid
 from anywhere in the room. Exits with 0 when at least 95 % of the photos with priors, and all without, are localized
 within 1 degree and 2 cm.
 
-    python -m gsfeatloc_ros.tools.demo --matcher xfeat --photos 40
+    gsfeatloc demo --matcher xfeat --photos 40
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ from gsfeatloc_ros.render import create_renderer
 from gsfeatloc_ros.simulate import Room, SimulatedPhoto, cover, simulate_photos, write_bag
 from gsfeatloc_ros.simulate.bag import CAMERA_INFO_TOPIC, IMAGE_TOPIC, PRIOR_TOPIC
 from gsfeatloc_ros.tools.options import add_old_name
+from gsfeatloc_ros.tools.status import run_tool
 
 MIN_SUCCESS_RATE = 0.95
 # The localizer's own names of the topics are remapped to those of the bag.
@@ -43,8 +44,15 @@ _KIDNAPPINGS = 5
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the demo; return the exit status."""
-    args = _parse(argv)
+    """Run the demo; return the exit status: 1 where it did not go well, 2 where something cannot be used."""
+    parser = make_parser()
+    args = parser.parse_args(argv)
+    if args.photos < 1:
+        parser.error("--photos must be at least 1")
+    return run_tool("demo", lambda: _demo(args))
+
+
+def _demo(args: argparse.Namespace) -> int:
     args.out.mkdir(parents=True, exist_ok=True)
     room = Room()
     room_map = cover(room)
@@ -81,18 +89,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0 if found and all(each.success for each in lost) else 1
 
 
-def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def make_parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    parser = argparse.ArgumentParser(
+        prog="gsfeatloc demo", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--out", type=Path, default=Path("demo_output"), help="folder of the results (%(default)s)")
     photos = parser.add_argument("--photos", type=int, default=40, help="number of photos (%(default)s)")
     add_old_name(parser, photos, "--queries")
     parser.add_argument(
         "--matcher", choices=sorted(MATCHERS), default=DEFAULT_MATCHER, help="of features (%(default)s)"
     )
-    args = parser.parse_args(argv)
-    if args.photos < 1:
-        parser.error("--photos must be at least 1")
-    return args
+    return parser
 
 
 def _play(photos: Sequence[SimulatedPhoto], replies: Iterable[Reply]) -> list[Score]:

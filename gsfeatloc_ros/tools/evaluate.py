@@ -1,9 +1,9 @@
 """Localize the test photos of scenes from wrong priors, and say how well.
 
-    python -m gsfeatloc_ros.tools.evaluate SCENE --method default --matcher xfeat --json result.json
-    python -m gsfeatloc_ros.tools.evaluate SCENE... --method default,published --matcher sift,xfeat --seed 0-9 \\
+    gsfeatloc evaluate SCENE --method default --matcher xfeat --json result.json
+    gsfeatloc evaluate SCENE... --method default,published --matcher sift,xfeat --seed 0-9 \\
         --jobs 4 --report report
-    python -m gsfeatloc_ros.tools.evaluate SCENE... --suite trust --jobs 2 --report trust
+    gsfeatloc evaluate SCENE... --suite trust --jobs 2 --report trust
 
 SCENE is a folder with photos and their poses (nerfstudio's transforms.json, NeRF-Synthetic or a COLMAP model) and a
 map. Where options name several scenes, methods, matchers, sigmas or seeds, all combinations are run. A query that was
@@ -34,6 +34,7 @@ from gsfeatloc_ros.evaluate.tables import RunResults, describe, over_seeds, quer
 from gsfeatloc_ros.evaluate.trust import describe_trust, trust_table
 from gsfeatloc_ros.match import DEFAULT_MATCHER, MATCHERS
 from gsfeatloc_ros.tools.options import CollectSettings, add_old_name, localizer_options, number, setting
+from gsfeatloc_ros.tools.status import run_tool
 
 _NOTHING = "nothing"
 
@@ -41,29 +42,28 @@ _NOTHING = "nothing"
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; return the exit status.
 
-    It is 0 when all photos were tried, 1 when something cannot be used and 130 when the user interrupted it.
+    It is 0 when all photos were tried, 2 when something cannot be used and 130 when the user interrupted it.
     """
-    parser = _parser()
+    parser = make_parser()
     options = parser.parse_args(arguments)
     _check(parser, options)
-    try:
-        results = _evaluate(options)
-        if options.json:
-            content = describe(results)
-            if options.suite:
-                content["trust"] = describe_trust(over_seeds(results))
-            options.json.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-        if options.report:
-            from gsfeatloc_ros.evaluate.report import write_report
+    command = shlex.join(["gsfeatloc", "evaluate", *(arguments or sys.argv[1:])])
+    interrupted = "interrupted; the same command goes on from here"
+    return run_tool("evaluate", lambda: _evaluate_and_write(options, command), interrupted)
 
-            command = shlex.join(["python", "-m", "gsfeatloc_ros.tools.evaluate", *(arguments or sys.argv[1:])])
-            print(f"evaluate: wrote {write_report(options.report, results, command)}")
-    except (ValueError, RuntimeError, OSError) as error:  # a scene, map, weights or file that cannot be used
-        print(f"evaluate: {error}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        print("evaluate: interrupted; the same command goes on from here", file=sys.stderr)
-        return 130
+
+def _evaluate_and_write(options: argparse.Namespace, command: str) -> int:
+    """Do what the options ask for; `command` is the command line that gave them."""
+    results = _evaluate(options)
+    if options.json:
+        content = describe(results)
+        if options.suite:
+            content["trust"] = describe_trust(over_seeds(results))
+        options.json.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    if options.report:
+        from gsfeatloc_ros.evaluate.report import write_report
+
+        print(f"evaluate: wrote {write_report(options.report, results, command)}")
     return 0
 
 
@@ -132,9 +132,10 @@ def _conditions(options: argparse.Namespace) -> list[Condition]:
     return [Condition(*names) for names in itertools.product(options.protocol, corruptions, degradations)]
 
 
-def _parser() -> argparse.ArgumentParser:
+def make_parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
     parser = argparse.ArgumentParser(
-        prog="evaluate",
+        prog="gsfeatloc evaluate",
         description="Localize the test photos of scenes from wrong priors.",
         epilog="LIST: one or several, separated by commas; numbers also as 0-9. All combinations are run.",
     )

@@ -1,7 +1,7 @@
 """Make the index of a map's views ahead of use, by which images without a prior are found.
 
-    python -m gsfeatloc_ros.tools.index room.ply
-    python -m gsfeatloc_ros.tools.index room.ply --poses SCENE --views 480 --matcher xfeat --out room.index
+    gsfeatloc index room.ply
+    gsfeatloc index room.ply --poses SCENE --views 480 --matcher xfeat --out room.index
 
 Without --out it goes where the node looks for it: beside the map, or into the user's cache. The node, which makes one
 by itself where there is none, takes it as long as map, frame and matcher are those that it was made with.
@@ -27,23 +27,21 @@ from gsfeatloc_ros.localize.settings import MatcherSettings, RendererSettings
 from gsfeatloc_ros.match import MATCHERS
 from gsfeatloc_ros.render import DEVICES
 from gsfeatloc_ros.tools.options import add_map_options, map_settings, number, print_reading
+from gsfeatloc_ros.tools.status import run_tool
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; return the exit status.
 
-    It is 0 when the index was written, 1 when something cannot be used and 130 when the user interrupted it.
+    It is 0 when the index was written, 2 when something cannot be used and 130 when the user interrupted it.
     """
-    options = _parser().parse_args(arguments)
+    options = make_parser().parse_args(arguments)
+    return run_tool("index", lambda: _index(options))
+
+
+def _index(options: argparse.Namespace) -> int:
     start = time.perf_counter()
-    try:
-        path, index = _make(options)
-    except (ValueError, RuntimeError, OSError) as error:  # a map, poses, weights or file that cannot be used
-        print(f"index: {error}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        print("index: interrupted", file=sys.stderr)
-        return 130
+    path, index = _make(options)
     size, seconds = path.stat().st_size / 1e6, time.perf_counter() - start
     print(f"{path}: {len(index)} views, {len(index.codes)} features, {size:.1f} MB, {seconds:.1f} s")
     return 0
@@ -75,9 +73,10 @@ def _make(options: argparse.Namespace) -> tuple[Path, ViewIndex]:
     return path, index
 
 
-def _parser() -> argparse.ArgumentParser:
+def make_parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
     parser = argparse.ArgumentParser(
-        prog="index", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+        prog="gsfeatloc index", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     index, matcher = IndexOptions(), MatcherSettings()
     parser.add_argument("map", type=Path, metavar="MAP", help="the Gaussian Splatting map")

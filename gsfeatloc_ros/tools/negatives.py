@@ -1,6 +1,6 @@
 """Show a localizer photos that are not of its map, and count the answers: each of them is wrong.
 
-    python -m gsfeatloc_ros.tools.negatives SCENE SCENE --matcher sift,xfeat
+    gsfeatloc negatives SCENE SCENE --matcher sift,xfeat
 
 In the map of every scene it looks for the scene's own photos mirrored and upside down, for the photos of the other
 scenes, for noise and for black.
@@ -19,25 +19,26 @@ from tqdm import tqdm
 from gsfeatloc_ros.evaluate.negatives import NegativeOptions, NegativeResult, localize_negatives, negative_table
 from gsfeatloc_ros.evaluate.scene import load_scene
 from gsfeatloc_ros.match import DEFAULT_MATCHER, MATCHERS
+from gsfeatloc_ros.tools.status import run_tool
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; return the exit status: 0 if no photo was given a pose, 2 if one was, 1 for an error."""
-    parser = _parser()
+    """Run the command; return the exit status: 0 if no photo was given a pose, 1 if one was, 2 for an error."""
+    parser = make_parser()
     options = parser.parse_args(arguments)
     matchers = options.matcher.split(",")
     if unknown := [name for name in matchers if name not in MATCHERS]:
         parser.error(f"--matcher: {', '.join(unknown)} is not one of {', '.join(MATCHERS)}")
-    try:
-        results = _localize(options, matchers)
-        if options.json:
-            rows = [result.row() for result in results]
-            options.json.write_text(json.dumps(rows, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-    except (ValueError, RuntimeError, OSError) as error:  # a scene, map, weights or file that cannot be used
-        print(f"negatives: {error}", file=sys.stderr)
-        return 1
+    return run_tool("negatives", lambda: _negatives(options, matchers))
+
+
+def _negatives(options: argparse.Namespace, matchers: Sequence[str]) -> int:
+    results = _localize(options, matchers)
+    if options.json:
+        rows = [result.row() for result in results]
+        options.json.write_text(json.dumps(rows, indent=2, allow_nan=False) + "\n", encoding="utf-8")
     print(negative_table(results))
-    return 2 if any(result.estimate.localized for result in results) else 0
+    return 1 if any(result.estimate.localized for result in results) else 0
 
 
 def _localize(options: argparse.Namespace, matchers: Sequence[str]) -> list[NegativeResult]:
@@ -52,9 +53,10 @@ def _localize(options: argparse.Namespace, matchers: Sequence[str]) -> list[Nega
     return results
 
 
-def _parser() -> argparse.ArgumentParser:
+def make_parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
     parser = argparse.ArgumentParser(
-        prog="negatives", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+        prog="gsfeatloc negatives", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("scene", type=Path, nargs="+", help="folder as for evaluate")
     parser.add_argument("--matcher", default=DEFAULT_MATCHER, help=f"of {', '.join(MATCHERS)}, or several")

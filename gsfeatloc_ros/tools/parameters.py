@@ -1,7 +1,7 @@
 """Write config/localizer.yaml and docs/parameters.md, which say of the node's parameters what its settings say.
 
-    python -m gsfeatloc_ros.tools.parameters            after a setting was changed
-    python -m gsfeatloc_ros.tools.parameters --check    exits with 1 where a file is not as it would be written
+    gsfeatloc parameters            after a setting was changed
+    gsfeatloc parameters --check    exits with 1 where a file is not as it would be written
 
 The settings are the dataclasses of ros_io/settings.py and localize/. It needs no ROS, but the repository.
 """
@@ -17,6 +17,7 @@ from pathlib import Path
 
 from gsfeatloc_ros.common.parameter import Parameter, Value
 from gsfeatloc_ros.ros_io.settings import PARAMETERS
+from gsfeatloc_ros.tools.status import run_tool
 
 _YAML_HEAD = """\
 # Every parameter of the localizer node, with its default. It is read when the node starts; some can be set later too.
@@ -61,13 +62,22 @@ _TYPES = {bool: "bool", int: "integer", float: "double", str: "string", tuple: "
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command line; return the exit status."""
+    """Run the command line; return the exit status: 1 where a file is out of date, 2 where it cannot be written."""
+    options = make_parser().parse_args(arguments)
+    return run_tool("parameters", lambda: _write_or_check(options))
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
     parser = argparse.ArgumentParser(
-        prog="parameters", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+        prog="gsfeatloc parameters", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--check", action="store_true", help="write nothing, but say what is out of date")
     parser.add_argument("--root", type=Path, default=Path(__file__).parents[2], help="of the repository: %(default)s")
-    options = parser.parse_args(arguments)
+    return parser
+
+
+def _write_or_check(options: argparse.Namespace) -> int:
     status = 0
     for name, text in (("config/localizer.yaml", yaml_text()), ("docs/parameters.md", page_text())):
         path = options.root / name

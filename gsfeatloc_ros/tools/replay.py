@@ -1,6 +1,6 @@
 """Localize the images of a recorded bag, without a ROS graph, as the node would.
 
-    python -m gsfeatloc_ros.tools.replay BAG --map room.ply --image /camera/image_raw \\
+    gsfeatloc replay BAG --map room.ply --image /camera/image_raw \\
         --camera-info /camera/camera_info --prior /prior --truth /ground_truth --out replayed
 
 BAG is a rosbag2: its folder, or an .mcap or .db3 file. Into the folder of --out go answers.tum, answers.csv (a line for
@@ -23,6 +23,7 @@ from typing import Any
 from tqdm import tqdm
 
 from gsfeatloc_ros.common.parameter import values_of
+from gsfeatloc_ros.common.words import in_one_line
 from gsfeatloc_ros.evaluate.extras import import_extra
 from gsfeatloc_ros.localize.engine import Engine, load_engine
 from gsfeatloc_ros.localize.map_index import index_for, index_key
@@ -49,6 +50,7 @@ from gsfeatloc_ros.tools.options import (
     print_reading,
     setting,
 )
+from gsfeatloc_ros.tools.status import INTERRUPTED, UNUSABLE, run_tool
 
 # The exit status when no image was localized.
 NOTHING_LOCALIZED = 3
@@ -59,18 +61,11 @@ _WITHOUT_EFFECT = ("autostart", "image.transport", "image.timeout", "state.path"
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; return the exit status.
 
-    It is 0 when all images were tried, 3 when none of them was localized, 1 when something cannot be used and 130 when
+    It is 0 when all images were tried, 3 when none of them was localized, 2 when something cannot be used and 130 when
     the user interrupted it. What came before a damage of the bag or an interruption is written.
     """
-    options = _parser().parse_args(arguments)
-    try:
-        return _replay(options)
-    except (ValueError, RuntimeError, OSError) as error:  # a bag, map, weights or folder that cannot be used
-        print(f"replay: {error}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        print("replay: interrupted", file=sys.stderr)
-        return 130
+    options = make_parser().parse_args(arguments)
+    return run_tool("replay", lambda: _replay(options))
 
 
 def _replay(options: argparse.Namespace) -> int:
@@ -111,11 +106,11 @@ def _collect(replay: Replay, count: int) -> tuple[list[ReplayedImage], int]:
                 localized += image.outcome.localized
                 progress.set_postfix_str(f"{localized} localized", refresh=False)
     except BagError as error:
-        print(f"replay: {error}", file=sys.stderr)
-        return images, 1
+        print(f"replay: {in_one_line(error)}", file=sys.stderr)
+        return images, UNUSABLE
     except KeyboardInterrupt:
         print("replay: interrupted", file=sys.stderr)
-        return images, 130
+        return images, INTERRUPTED
     return images, 0
 
 
@@ -174,9 +169,10 @@ def _engine(settings: Settings) -> Engine:
     return engine.with_index(index_for(engine, settings.index, key))
 
 
-def _parser() -> argparse.ArgumentParser:
+def make_parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
     parser = argparse.ArgumentParser(
-        prog="replay", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+        prog="gsfeatloc replay", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     matcher, localizer = MatcherSettings(), LocalizerOptions()
     parser.add_argument("bag", type=Path, help="folder of a rosbag2, or an .mcap or .db3 file")

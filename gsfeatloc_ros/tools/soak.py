@@ -3,12 +3,12 @@
 A process of its own publishes photos of the simulated room with real-time stamps, their camera_info, and priors that
 are off as a robot's odometry is. Meanwhile the services are called every few seconds. Exits with 1 if a target fails.
 
-    python -m gsfeatloc_ros.tools.soak --seconds 600 --size 1920x1080 --rate 10 --folder /tmp/soak --json soak.json
+    gsfeatloc soak --seconds 600 --size 1920x1080 --rate 10 --folder /tmp/soak --json soak.json
 
 With --flood many more requests come on top, from a process of its own, at one time of the stream; it may be given more
 than once. 400 requests at 15 a second, and 500 at once:
 
-    python -m gsfeatloc_ros.tools.soak --seconds 120 --flood localize_image,400,15,30 --flood relocalize,500,0,80
+    gsfeatloc soak --seconds 120 --flood localize_image,400,15,30 --flood relocalize,500,0,80
 """
 
 from __future__ import annotations
@@ -25,14 +25,19 @@ from gsfeatloc_ros.client.observer import Observer
 from gsfeatloc_ros.client.process import isolate_ros, running_localizer
 from gsfeatloc_ros.client.robot import prepare_room, run_robot
 from gsfeatloc_ros.client.soak_report import add_floods, summarize
+from gsfeatloc_ros.tools.status import run_tool
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the soak; return the exit status."""
-    args = _parse(argv)
-    isolate_ros()
+    """Run the soak; return the exit status: 1 where it did not go well, 2 where something cannot be used."""
+    args = make_parser().parse_args(argv)
+    return run_tool("soak", lambda: _soak(args))
+
+
+def _soak(args: argparse.Namespace) -> int:
     print(f"soak: the map and the photos are kept in {args.folder}", file=sys.stderr)
     map_file, photos_file = prepare_room(args.folder, args.size)
+    isolate_ros()
     robot = multiprocessing.get_context("spawn").Process(
         target=run_robot, args=(photos_file, args.size, args.rate, args.seconds)
     )
@@ -68,8 +73,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0 if all(result["targets"].values()) else 1
 
 
-def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def make_parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    parser = argparse.ArgumentParser(
+        prog="gsfeatloc soak", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument(
         "--seconds", type=float, default=600, help="how long (%(default)g); memory still settles before 300"
     )
@@ -84,7 +92,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
         help="SERVICE,REQUESTS,RATE,SECOND: requests on top, so many a second (0: at once), from that second on",
     )
     parser.add_argument("--json", type=Path, help="file of the results")
-    return parser.parse_args(argv)
+    return parser
 
 
 def _size(text: str) -> tuple[int, int]:

@@ -1,7 +1,7 @@
 """Compile the kernels and fetch a matcher's weights ahead of use, so that a robot's first start is a fast one.
 
-python -m gsfeatloc_ros.tools.warmup
-python -m gsfeatloc_ros.tools.warmup --matcher xfeat
+gsfeatloc warmup
+gsfeatloc warmup --matcher xfeat
 """
 
 from __future__ import annotations
@@ -16,25 +16,33 @@ from gsfeatloc_ros.localize.first_run import warm_up
 from gsfeatloc_ros.localize.settings import MatcherSettings
 from gsfeatloc_ros.match import MATCHERS
 from gsfeatloc_ros.render import DEVICES
+from gsfeatloc_ros.tools.status import run_tool
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command line; return the exit status."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    """Run the command line; return the exit status: 0, or 2 where weights or device cannot be used."""
+    options = make_parser().parse_args(arguments)
+    return run_tool("warmup", lambda: _warm_up(options))
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    parser = argparse.ArgumentParser(
+        prog="gsfeatloc warmup", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--matcher", choices=MATCHERS, help="get its weights as well, and localize with it once")
     parser.add_argument("--weights", default="", help="path of the weights, as the parameter matcher.weights")
     parser.add_argument("--device", choices=DEVICES, default="auto", help="to render on (default: %(default)s)")
-    options = parser.parse_args(arguments)
+    return parser
+
+
+def _warm_up(options: argparse.Namespace) -> int:
     start = time.perf_counter()
-    try:
-        matcher = None
-        if options.matcher:
-            matcher = load_matcher(MatcherSettings(options.matcher, options.weights), options.device)
-        loaded = time.perf_counter()
-        done = warm_up(matcher, options.device)
-    except (ValueError, RuntimeError, OSError) as error:
-        print(f"warmup: {error}", file=sys.stderr)
-        return 1
+    matcher = None
+    if options.matcher:
+        matcher = load_matcher(MatcherSettings(options.matcher, options.weights), options.device)
+    loaded = time.perf_counter()
+    done = warm_up(matcher, options.device)
     compiled = f"{done.compiled} functions compiled" if done.compiled else "all in the cache"
     print(f"kernels: {compiled}, {done.kernels_seconds:.1f} s; kept in {kernel_cache_folder()}")
     if done.estimate is not None:

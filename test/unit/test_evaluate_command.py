@@ -424,13 +424,13 @@ def test_help_names_the_options_of_the_localizer(capsys):
 
 
 def test_command_on_a_folder_without_a_scene(tmp_path, capsys):
-    assert main([str(tmp_path)]) == 1
+    assert main([str(tmp_path)]) == 2
     assert "transforms.json" in capsys.readouterr().err
 
 
 def test_command_on_a_scene_without_a_map(room_scene, capsys):
     (room_scene / "map.ply").unlink()
-    assert main([str(room_scene)]) == 1
+    assert main([str(room_scene)]) == 2
     assert "holds no map (map.ply, " in capsys.readouterr().err
 
 

@@ -97,7 +97,7 @@ def test_training_poses_are_used_in_the_robots_frame(kind, map_path, tmp_path, r
 def test_what_cannot_be_used_is_said_in_one_line(map_path, monkeypatch, capsys, arguments, says) -> None:
     monkeypatch.chdir(map_path.parent)
     Path("empty.json").write_text('{"frames": []}')
-    assert index.main(arguments) == 1
+    assert index.main(arguments) == 2
     error = capsys.readouterr().err
     # Before it there may be one on how the map is read.
     *notes, reason = error.splitlines()
@@ -108,7 +108,7 @@ def test_what_cannot_be_used_is_said_in_one_line(map_path, monkeypatch, capsys, 
 
 
 def test_a_map_that_is_not_there_makes_no_folder(tmp_path) -> None:
-    assert index.main([str(tmp_path / "a" / "map.ply")]) == 1
+    assert index.main([str(tmp_path / "a" / "map.ply")]) == 2
     assert not (tmp_path / "a").exists()
 
 
@@ -120,7 +120,7 @@ def test_wrong_command_line_ends_with_its_usage(capsys, arguments) -> None:
     with pytest.raises(SystemExit) as exit_:
         index.main(arguments)
     assert exit_.value.code == 2
-    assert "usage: index" in capsys.readouterr().err
+    assert "usage: gsfeatloc index" in capsys.readouterr().err
 
 
 def test_the_user_may_interrupt_it(map_path, monkeypatch, capsys) -> None:

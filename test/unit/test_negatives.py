@@ -110,14 +110,14 @@ def test_tool_gives_no_negative_a_pose(scene_folder, tmp_path, capsys, sigma):
 
 
 def test_the_old_name_of_the_tool_works_with_a_notice(tmp_path, capsys):
-    assert strangers.main([str(tmp_path)]) == 1
+    assert strangers.main([str(tmp_path)]) == 2
     notice, error = capsys.readouterr().err.splitlines()
     assert notice == "tools.strangers is now tools.negatives; the old name works until the next release"
     assert error.startswith(f"negatives: {tmp_path}: holds none of ")
 
 
 def test_tool_says_what_cannot_be_used(tmp_path, capsys):
-    assert negatives.main([str(tmp_path)]) == 1
+    assert negatives.main([str(tmp_path)]) == 2
     assert "negatives: " in capsys.readouterr().err
     with pytest.raises(SystemExit, match="2"):
         negatives.main([str(tmp_path), "--matcher", "sift,magic"])

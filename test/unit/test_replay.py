@@ -300,7 +300,7 @@ def test_no_answer_at_all(room_camera, room_map_file, tmp_path, capsys):
 
 def refused(capsys, arguments: list[str]) -> str:
     """What the command says when it ends with 1: one line."""
-    assert main(arguments) == 1
+    assert main(arguments) == 2
     said = capsys.readouterr().err
     assert said.startswith("replay: ")
     assert said.count("\n") == 1
@@ -365,7 +365,7 @@ def test_what_comes_before_a_damage_is_kept(room_camera, room_photos, room_map_f
     whole = file.read_bytes()
     middle = len(whole) // 2
     file.write_bytes(whole[:middle] + b"\xff" * 5000 + whole[middle + 5000 :])
-    assert main(replay_arguments(tmp_path / "bag", room_map_file, tmp_path / "out")) == 1
+    assert main(replay_arguments(tmp_path / "bag", room_map_file, tmp_path / "out")) == 2
     said = capsys.readouterr()
     assert "bag: is damaged, and ends here: " in said.err
     assert "; the bag has 4" in said.out

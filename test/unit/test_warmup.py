@@ -209,5 +209,5 @@ def test_tool_says_what_it_did(capsys):
 
 
 def test_tool_says_what_is_missing(capsys):
-    assert warmup.main(["--matcher", "xfeat", "--weights", "/nowhere/xfeat.pt"]) == 1
+    assert warmup.main(["--matcher", "xfeat", "--weights", "/nowhere/xfeat.pt"]) == 2
     assert "/nowhere/xfeat.pt" in capsys.readouterr().err

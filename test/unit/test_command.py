@@ -1,0 +1,134 @@
+"""The command gsfeatloc and the tools behind it: they are all there, complete their words and refuse what they must."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from small_maps import random_map
+
+from gsfeatloc_ros.maps.ply import write_ply
+from gsfeatloc_ros.tools import command
+from gsfeatloc_ros.tools.command import TOOLS
+
+ROOT = Path(__file__).parents[2]
+# Those that talk to ROS.
+NEED_ROS = {"demo", "soak"}
+# The command lines of each tool in which BAD is a file or a folder, and MAP a map.
+COMMAND_LINES = {
+    "index": ["BAD", "MAP --poses BAD"],
+    "warmup": ["--matcher xfeat --weights BAD"],
+    "replay": ["BAD --map MAP --image /i --camera-info /c --out OUT"],
+    "demo": ["--out BAD"],
+    "evaluate": ["BAD"],
+    "negatives": ["BAD"],
+    "benchmark": ["render --map BAD", "render --scene BAD", "query --scene BAD"],
+    "soak": ["--folder BAD"],
+    "parameters": ["--root BAD"],
+}
+KINDS = ["missing", "folder", "empty", "garbage"]
+# Made by those that write there.
+MADE = {("demo", "missing"), ("demo", "folder"), ("soak", "missing"), ("soak", "folder")}
+
+
+def run(*arguments: str, **environment: str) -> subprocess.CompletedProcess:
+    """Run the command in a process of its own."""
+    return subprocess.run(
+        [sys.executable, "-m", "gsfeatloc_ros.tools.command", *arguments],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        cwd=ROOT,
+        env=os.environ | environment,
+    )
+
+
+def test_every_tool_is_in_the_table_and_in_setup_py() -> None:
+    others = {"__init__", "command", "options", "status", "strangers"}  # the last is an old name
+    assert {path.stem for path in (ROOT / "gsfeatloc_ros" / "tools").glob("*.py")} - others == set(TOOLS)
+    (listed,) = (
+        ast.literal_eval(item.value)
+        for item in ast.parse((ROOT / "setup.py").read_text()).body
+        if isinstance(item, ast.Assign) and item.targets[0].id == "tools"
+    )
+    assert sorted(TOOLS) == listed
+
+
+def test_without_a_tool_or_with_an_unknown_one_it_names_them(capsys) -> None:
+    for arguments in ([], ["nothing"]):
+        with pytest.raises(SystemExit, match="2"):
+            command.main(arguments)
+        assert "usage: gsfeatloc [-h] TOOL" in capsys.readouterr().err
+
+
+def test_help_names_all_tools_and_imports_nothing_heavy() -> None:
+    code = """
+import sys
+from gsfeatloc_ros.tools import command
+try:
+    command.main(["--help"])
+finally:
+    print("heavy:", *sorted({name.split(".")[0] for name in sys.modules} & {"numpy", "numba", "torch", "cv2", "rclpy"}))
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, cwd=ROOT)
+    assert done.returncode == 0
+    assert done.stdout.splitlines()[-1] == "heavy:"
+    assert set(TOOLS) <= set(done.stdout.split())
+
+
+@pytest.mark.parametrize("name", TOOLS)
+def test_help_says_how_the_tool_is_called(name, capsys) -> None:
+    if name in NEED_ROS:
+        pytest.importorskip("rclpy")
+    with pytest.raises(SystemExit, match="0"):
+        command.main([name, "--help"])
+    text = capsys.readouterr().out
+    assert text.startswith(f"usage: gsfeatloc {name} ")
+    assert "python -m" not in text
+
+
+@pytest.fixture
+def places(tmp_path) -> dict[str, str]:
+    write_ply(tmp_path / "map.ply", random_map(50, 0, seed=0))
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "empty").touch()
+    (tmp_path / "garbage").write_bytes(bytes(range(256)) * 5)
+    return {kind: str(tmp_path / kind) for kind in KINDS} | {"MAP": str(tmp_path / "map.ply"), "OUT": str(tmp_path / "out")}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("line", [f"{name} {line}" for name, lines in COMMAND_LINES.items() for line in lines])
+def test_what_cannot_be_used_is_named_in_one_line_with_status_2(line, kind, places, capfd) -> None:
+    name, *words = line.split()
+    if (name, kind) in MADE:
+        pytest.skip("it is a place to write to")
+    if name in NEED_ROS:
+        pytest.importorskip("rclpy")
+    bad = places[kind]
+    tool = importlib.import_module(f"gsfeatloc_ros.tools.{name}")
+    assert tool.main([places.get(word.replace("BAD", kind), word) for word in words]) == 2
+    *notes, reason = capfd.readouterr().err.splitlines()
+    assert reason.startswith(f"{name}: ")
+    assert bad in reason
+    assert "Traceback" not in "".join(notes)
+
+
+def test_every_tool_is_tried_with_what_cannot_be_used() -> None:
+    assert set(COMMAND_LINES) == set(TOOLS)
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [("gsfeatloc war", {"warmup"}), ("gsfeatloc warmup --mat", {"--matcher"}), ("gsfeatloc war --mat", set())],
+)
+def test_words_are_completed(line, expected, tmp_path) -> None:
+    answer = tmp_path / "answer"
+    point = str(len(line))
+    run(_ARGCOMPLETE="1", COMP_LINE=line, COMP_POINT=point, _ARGCOMPLETE_STDOUT_FILENAME=str(answer), IFS="\v")
+    words = answer.read_text().split("\v") if answer.exists() else []
+    assert {word.strip() for word in words if word} == expected
