@@ -98,7 +98,8 @@ def places(tmp_path) -> dict[str, str]:
     (tmp_path / "folder").mkdir()
     (tmp_path / "empty").touch()
     (tmp_path / "garbage").write_bytes(bytes(range(256)) * 5)
-    return {kind: str(tmp_path / kind) for kind in KINDS} | {"MAP": str(tmp_path / "map.ply"), "OUT": str(tmp_path / "out")}
+    named = {"MAP": "map.ply", "OUT": "out"} | {kind: kind for kind in KINDS}
+    return {word: str(tmp_path / name) for word, name in named.items()}
 
 
 @pytest.mark.parametrize("kind", KINDS)
