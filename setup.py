@@ -16,7 +16,7 @@ superpoint = ["transformers>=5.0,<6"]
 
 # What `ros2 run gsfeatloc_ros NAME` finds, where colcon or bloom installs. A wheel would put names as common as `index`
 # into a user's bin: there they are subcommands of gsfeatloc alone.
-tools = ["benchmark", "demo", "evaluate", "index", "negatives", "parameters", "replay", "soak", "warmup"]
+tools = ["align", "benchmark", "demo", "evaluate", "index", "negatives", "parameters", "replay", "soak", "warmup"]
 for_ros = {"install", "develop"} & set(sys.argv)
 
 setup(

@@ -34,6 +34,7 @@ class Role(Enum):
     TF = "tf"
     TF_STATIC = "tf_static"
     TRUTH = "truth"
+    IMU = "imu"
 
 
 # What messages are taken from the topic of each role.
@@ -46,6 +47,7 @@ _TYPES = {
     Role.TF: (_TF,),
     Role.TF_STATIC: (_TF,),
     Role.TRUTH: (*_POSES, _ODOMETRY),
+    Role.IMU: ("sensor_msgs/msg/Imu",),
 }
 # Taken if they are there: a bag need not have them.
 _OPTIONAL = (Role.TF, Role.TF_STATIC)
@@ -122,10 +124,11 @@ def open_bag(path: Path, topics: Mapping[Role, Sequence[str]]) -> Iterator[Bag]:
 
     Args:
         path: of the bag.
-        topics: those of each role that is wanted, one of the images among them; those of tf need not be there.
+        topics: those of each role that is wanted; those of tf need not be there.
 
     Raises:
-        BagError: the bag cannot be read, has no such topic, or messages of another type on it; or it has no images.
+        BagError: the bag cannot be read, has no such topic, or messages of another type on it; or it has no images,
+            where these are wanted.
     """
     if not path.exists():
         raise BagError(f"{path}: there is no such bag")
@@ -136,12 +139,11 @@ def open_bag(path: Path, topics: Mapping[Role, Sequence[str]]) -> Iterator[Bag]:
             for topic in names:
                 if _is_there(path, files, role, topic):
                     roles.setdefault(topic, []).append(role)
-        images = sum(
-            count for file in files for channel, count in file.counts.items() if channel.topic in topics[Role.IMAGE]
-        )
-        if not images:
-            raise BagError(f"{path}: has no message on {_either(topics[Role.IMAGE])}")
-        times = [time for file in files if file.times for time in file.times]
+        wanted = topics.get(Role.IMAGE, ())
+        images = sum(count for file in files for channel, count in file.counts.items() if channel.topic in wanted)
+        if wanted and not images:
+            raise BagError(f"{path}: has no message on {_either(wanted)}")
+        times = [time for file in files if file.times for time in file.times] or [0]
         start, seconds = min(times), 1e-9 * (max(times) - min(times))
         types = get_typestore(Stores.ROS2_JAZZY)
         yield Bag(path, files[0].storage, images, start, seconds, files, roles, types)

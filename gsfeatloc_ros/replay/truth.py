@@ -18,9 +18,11 @@ class Trajectory:
 
     Args:
         poses: stamps in nanoseconds with T_map_camera (4, 4), in any order; of two with the same stamp the last counts.
+        max_gap: seconds between poses beyond which it is not known what was between them.
     """
 
-    def __init__(self, poses: Iterable[tuple[int, np.ndarray]]) -> None:
+    def __init__(self, poses: Iterable[tuple[int, np.ndarray]], max_gap: float = MAX_GAP) -> None:
+        self._max_gap = round(1e9 * max_gap)
         by_stamp = dict(poses)
         self._stamps = sorted(by_stamp)
         self._poses = [by_stamp[stamp] for stamp in self._stamps]
@@ -37,12 +39,12 @@ class Trajectory:
         """Return the pose (4, 4) at a stamp in nanoseconds.
 
         Between two poses the translation is interpolated linearly and the rotation along the shortest way (slerp). None
-        outside the trajectory, and between two poses that are more than MAX_GAP apart.
+        outside the trajectory, and between two poses that are more than the largest gap apart.
         """
         after = bisect_left(self._stamps, stamp)
         if after < len(self) and self._stamps[after] == stamp:
             return self._poses[after]
-        if after in (0, len(self)) or self._stamps[after] - self._stamps[after - 1] > 1e9 * MAX_GAP:
+        if after in (0, len(self)) or self._stamps[after] - self._stamps[after - 1] > self._max_gap:
             return None
         share = (stamp - self._stamps[after - 1]) / (self._stamps[after] - self._stamps[after - 1])
         return interpolate(self._poses[after - 1], self._poses[after], share)

@@ -146,5 +146,20 @@ class TransformStamped(Protocol):
     transform: Transform
 
 
+class Vector3(Protocol):
+    """geometry_msgs/Vector3."""
+
+    x: float
+    y: float
+    z: float
+
+
+class Imu(Protocol):
+    """sensor_msgs/Imu."""
+
+    header: Header
+    linear_acceleration: Vector3
+
+
 AnyImage = Image | CompressedImage
 AnyPose = PoseStamped | PoseWithCovarianceStamped

@@ -16,6 +16,7 @@ from functools import partial
 # Names of the tools, modules of this room with `main` and `make_parser`, and what they are for.
 TOOLS = {
     "index": "make the index of a map's views, which finds images without a prior",
+    "align": "find where a map's frame lies in the robot's: scale, rotation, translation",
     "warmup": "compile the kernels and fetch a matcher's weights ahead of use",
     "replay": "localize the images of a recorded bag as the node would, without ROS",
     "demo": "localize a camera in a made-up room, from start to end over ROS",

@@ -22,6 +22,10 @@ NEED_ROS = {"demo", "soak"}
 # The command lines of each tool in which BAD is a file or a folder, and MAP a map.
 COMMAND_LINES = {
     "index": ["BAD", "MAP --poses BAD"],
+    "align": [
+        "trajectory --answers BAD --trajectory BAD --out OUT",
+        "drive BAD --map MAP --image /i --camera-info /c --out OUT",
+    ],
     "warmup": ["--matcher xfeat --weights BAD"],
     "replay": ["BAD --map MAP --image /i --camera-info /c --out OUT"],
     "demo": ["--out BAD"],

@@ -1,0 +1,1 @@
+"""Where a map's frame lies in the robot's: the similarity that the parameters map.* declare, estimated."""
