@@ -146,6 +146,9 @@ def _read_png(data: bytes) -> Picture:
     kept, place = [_PNG_START], len(_PNG_START)
     while place < len(data):
         end = place + 12 + int.from_bytes(data[place : place + 4], "big")
+        # The decoder takes memory for as many bytes as a chunk claims to have.
+        if end > len(data):
+            raise ValueError("is a damaged PNG: it is cut short")
         kind = data[place + 4 : place + 8]
         if kind in _PNG_CHUNKS:
             kept.append(data[place:end])

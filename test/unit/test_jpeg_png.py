@@ -109,6 +109,13 @@ def test_a_jpeg_of_12_bits_is_named():
 
 
 @pytest.mark.usefixtures("no_decoder")
+def test_a_png_whose_chunk_is_longer_than_the_file_is_refused():
+    """The decoder would take 4 GB for it; found by the fuzz campaign."""
+    with pytest.raises(ValueError, match="cut short"):
+        read_header(PNG[:33] + b"\xff\x7f\x02\x57" + PNG[37:])
+
+
+@pytest.mark.usefixtures("no_decoder")
 def test_a_png_that_holds_more_than_its_pixels_is_refused():
     """All of it would be unpacked: gigabytes."""
     with pytest.raises(ValueError, match="64x48 pixels that holds more"):
