@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -13,7 +14,7 @@ from gsfeatloc_ros.common.local_structure import local_structure
 from gsfeatloc_ros.common.photo import Photo
 from gsfeatloc_ros.localize.query import MatchedView, Query
 from gsfeatloc_ros.pose.lift import lift
-from gsfeatloc_ros.pose.solve import reprojection_errors
+from gsfeatloc_ros.pose.solve import Correspondences
 
 # Cells across and down the photo.
 CELLS = (16, 12)
@@ -59,6 +60,16 @@ class Comparison:
     disagreeing: np.ndarray
     correlation: np.ndarray
 
+    @property
+    def explained_inlier_ratio(self) -> float:
+        """Share of the corners of both that agrees in cells that look alike (Jeffreys' estimate); NaN without any.
+
+        What covers the photo disagrees elsewhere; a place that is only nearly the same disagrees among what agrees.
+        """
+        alike = (self.agreeing > self.disagreeing) & (self.correlation >= _MIN_CORRELATION)
+        agreeing, disagreeing = self.agreeing[alike].sum(), self.disagreeing[alike].sum()
+        return float((agreeing + 0.5) / (agreeing + disagreeing + 1)) if agreeing else float("nan")
+
     def explained_correlation(self, quantile: float) -> float:
         """Return a quantile of the correlation over the cells in which most corners agree; NaN without any."""
         values = self.correlation[(self.agreeing > self.disagreeing) & np.isfinite(self.correlation)]
@@ -71,19 +82,19 @@ class Comparison:
         return float(changed[compared].mean()) if compared.any() else float("nan")
 
 
-def compare(query: Query, view: MatchedView, tolerance: float) -> Comparison:
-    """Compare a photo with the view from the estimate, which has a solution.
+def compare(
+    query: Query, view: MatchedView, errors: Callable[[Correspondences], np.ndarray], tolerance: float
+) -> Comparison:
+    """Compare a photo with the view from the estimate.
 
-    Corners agree with it that are off by at most `tolerance` pixels.
+    Corners agree with it that are off by at most `tolerance` pixels; `errors` says by how many each of (M,) is.
     """
-    assert view.solution is not None
-    options, camera, pose = query.components.options, query.photo.camera, view.solution.T_map_camera
+    options, camera = query.components.options, query.photo.camera
     with query.clock.stage("track"):
         back = query.tracker.track_back(view.image)
     lifted = lift(view.render, camera, view.pose, back.b, options.lift)
     found = query.correspondences(back.a, lifted, view.pose)
-    agrees = view.solution.errors <= tolerance
-    agrees_back = reprojection_errors(camera, pose, found) <= tolerance
+    agrees, agrees_back = errors(view.found) <= tolerance, errors(found) <= tolerance
     pixels, all_agree = np.concatenate([view.found.pixels, found.pixels]), np.concatenate([agrees, agrees_back])
     return Comparison(
         inlier_ratio=float(agrees.mean()),

@@ -19,14 +19,20 @@ _MAX_FOCAL_ERROR = 0.01
 _FOCAL_SIGMAS = 2.0
 # Of a pose that no prior expects so many times the risk is taken, for a mirror image may be one; and of one that is so
 # many times less likely to be wrong than what the photo's mirror image suggests, all of it.
-_UNEXPECTED = 1e-5
+_UNEXPECTED = 1e-8
 _MIRROR_IS_WORSE = 1e-2
+# What is seen in a picture on a wall or in a mirror, or is one of several, may be somewhere else: at most this share of
+# the photo may be covered or changed, and less for a pose that no prior expects.
+_MAX_CHANGED = 0.7
+_MAX_CHANGED_UNEXPECTED = 0.4
 # The weights of what tells right from wrong answers (docs/trust.md), and what their sum is shifted and scaled by to be
-# the logarithm of the odds that the answer is wrong. Ratios count by their logit, correlations by Fisher's z.
-_WEIGHTS = {"inlier_ratio": -1.11, "render_inlier_ratio": -1.61, "correlation": -5.03, "low_correlation": -2.22}
-_OFFSET, _SLOPE = 13.81, 3.07
+# the logarithm of the odds that the answer is wrong. The ratio counts by its logit, correlations by Fisher's z.
+_WEIGHTS = {"explained_inlier_ratio": -4.31, "correlation": -5.34, "low_correlation": -7.14}
+_OFFSET, _SLOPE = 27.54, 4.6
 # How numbers are written as texts, if not with three decimals.
 _FORMATS = {"probability_wrong": ".1e", "mirror_probability_wrong": ".1e", "focal_error": ".4f", "focal_sigma": ".4f"}
+# No photo is taken to say more.
+_LEAST_PROBABILITY = 1e-15
 # Ratios and correlations are taken to be no nearer to 1 than this.
 _MIN_DOUBT = 0.005
 
@@ -42,6 +48,8 @@ class Evidence:
         inliers: number of those that agree with the pose; 0 without pose.
         inlier_ratio: share of the lifted ones that agrees, with some allowance for blur.
         render_inlier_ratio: the same of the render's corners that were found in the photo.
+        explained_inlier_ratio: the same of both in the cells of the photo that look as in the map, half a corner of
+            each kind added: of few corners less is known.
         coverage: share of the photo's cells, in a grid of 8 x 6, that hold an inlier.
         correlation: median correlation, in [-1, 1], of photo and render in the cells whose corners agree.
         low_correlation: that which a quarter of these cells do not reach.
@@ -67,6 +75,7 @@ class Evidence:
     inliers: int = 0
     inlier_ratio: float = float("nan")
     render_inlier_ratio: float = float("nan")
+    explained_inlier_ratio: float = float("nan")
     coverage: float = 0.0
     correlation: float = float("nan")
     low_correlation: float = float("nan")
@@ -124,7 +133,7 @@ class Limits:
     max_deviation: float = parameter(
         8.0,
         "Farther than this many standard deviations from the prior, or without one, the mirror image must not fit, or "
-        "1e-5 of max_risk is taken.",
+        "1e-8 of max_risk is taken.",
         (0.1, 1e6),
         live=True,
     )
@@ -150,9 +159,14 @@ def verdict(evidence: Evidence, limits: Limits) -> tuple[str, ...]:
         reasons.append(
             f"it is wrong with a probability of {evidence.probability_wrong:.1g} (at most {max_risk:g}{why}): "
             f"{evidence.inlier_ratio:.0%} of the photo's corners and {evidence.render_inlier_ratio:.0%} of the "
-            f"render's agree, there with a correlation of {evidence.correlation:.2f}; {evidence.changed:.0%} of the "
-            f"photo is not as in the map; {evidence.counts}"
+            f"render's agree, {evidence.explained_inlier_ratio:.0%} where both look alike, with a correlation of "
+            f"{evidence.correlation:.2f}; {evidence.changed:.0%} of the photo is not as in the map; {evidence.counts}"
         )
+    unexpected = _why_unexpected(evidence, limits)
+    max_changed = _MAX_CHANGED_UNEXPECTED if unexpected else _MAX_CHANGED
+    if not evidence.changed <= max_changed:
+        most = f"at most {max_changed:.0%}{unexpected}"
+        reasons.append(f"{evidence.changed:.0%} of the photo is not as in the map ({most})")
     if evidence.coverage < limits.min_coverage:
         reasons.append(f"inliers in {evidence.coverage:.0%} of the photo (at least {limits.min_coverage:.0%} needed)")
     return tuple(reasons)
@@ -165,11 +179,18 @@ def _is_expected(evidence: Evidence, limits: Limits) -> bool:
 
 
 def _why_so_little_risk(evidence: Evidence, limits: Limits) -> str:
-    """Return in words why less risk is taken with a pose; nothing for one that is expected."""
+    """Return in words why less risk is taken with a pose; nothing for one with which all is."""
     if _is_expected(evidence, limits):
         return ""
     if evidence.mirror_probability_wrong < 1:
         return ", for the photo's mirror image fits about as well: is the image flipped?"
+    return _why_unexpected(evidence, limits)
+
+
+def _why_unexpected(evidence: Evidence, limits: Limits) -> str:
+    """Return in words why no prior expects a pose; nothing for one that is where a prior says."""
+    if evidence.deviation <= limits.max_deviation:
+        return ""
     if evidence.deviation > limits.max_deviation:
         return f", for the pose is {evidence.deviation:.1f} standard deviations from the prior"
     return " without a prior"
@@ -193,10 +214,11 @@ def probability_wrong(evidence: Evidence) -> float:
     A logistic regression on right answers (also of photos that are badly lit, blurred or covered) and on wrong poses
     that matched well (mirror images of a nearly symmetric object); see docs/trust.md for how far it can be trusted.
     """
-    ratios = np.clip([evidence.inlier_ratio, evidence.render_inlier_ratio], _MIN_DOUBT, 1 - _MIN_DOUBT)
+    ratio = np.clip(evidence.explained_inlier_ratio, _MIN_DOUBT, 1 - _MIN_DOUBT)
     correlations = np.clip([evidence.correlation, evidence.low_correlation], _MIN_DOUBT - 1, 1 - _MIN_DOUBT)
-    values = np.concatenate([np.log(ratios / (1 - ratios)), np.arctanh(correlations)])
-    return float(1 / (1 + np.exp(-_SLOPE * (_OFFSET + values @ list(_WEIGHTS.values())))))
+    values = np.array([np.log(ratio / (1 - ratio)), *np.arctanh(correlations)])
+    log_odds = _SLOPE * (_OFFSET + values @ list(_WEIGHTS.values()))
+    return float(np.maximum(1 / (1 + np.exp(-log_odds)), _LEAST_PROBABILITY))
 
 
 def coverage(pixels: np.ndarray, width: int, height: int) -> float:

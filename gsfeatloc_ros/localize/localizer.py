@@ -36,7 +36,7 @@ from gsfeatloc_ros.localize.search import SEARCH_WIDTH, Search
 from gsfeatloc_ros.maps.gaussian_map import Reading
 from gsfeatloc_ros.match import Matcher, Tracker, create_tracker
 from gsfeatloc_ros.pose.camera_fit import CameraFit, fit_camera
-from gsfeatloc_ros.pose.solve import Correspondences
+from gsfeatloc_ros.pose.solve import Correspondences, reprojection_errors
 from gsfeatloc_ros.render.base import Renderer
 
 # A render nearer to the photo than this many pixels is at the estimate.
@@ -149,6 +149,7 @@ class Localizer:
         mirror_probability_wrong = cache(partial(self._mirror_probability_wrong, query))
         for pose in search.poses():
             candidate = self._refine(query, pose, prior)
+            search.tried(candidate.view)
             if query.components.index is not None and is_uncertain(candidate.evidence, limits):
                 candidate = candidate.against_mirror(mirror_probability_wrong(), limits)
             if candidate.believed:
@@ -187,7 +188,11 @@ class Localizer:
         few = replace(options, search=replace(options.search, max_views=_MIRROR_VIEWS, skipped=0))
         mirror = Query(replace(query.components, options=few), query.photo.mirrored(), query.clock)
         search = Search(mirror.limited(SEARCH_WIDTH), None, self._now)
-        found = [self._refine(mirror, pose, None).evidence for pose in islice(search.poses(), _MIRROR_POSES)]
+        found = []
+        for pose in islice(search.poses(), _MIRROR_POSES):
+            candidate = self._refine(mirror, pose, None)
+            search.tried(candidate.view)
+            found.append(candidate.evidence)
         return min((e.probability_wrong for e in found if e.inliers >= options.limits.min_inliers), default=1.0)
 
     def _refine(self, query: Query, pose: np.ndarray, prior: Prior | None) -> _Candidate:
@@ -221,14 +226,18 @@ class Localizer:
             return _Candidate(view, evidence, None, verdict(evidence, options.limits))
         # In a blurred photo all corners are less certain.
         blurred = min(evidence.blur_px / _BLUR_THAT_DOUBLES_ERRORS, 1.0)
-        comparison = compare(query, view, (1.0 + blurred) * options.pose.max_reprojection_error)
-        with query.clock.stage("verify"):
-            pose = view.solution.T_map_camera
+        tolerance = (1.0 + blurred) * options.pose.max_reprojection_error
+        pose = view.solution.T_map_camera
+        with query.clock.stage("solve"):
             fit = fit_camera(camera, pose, _near(view), options.pose)
+        errors = partial(fit.reprojection_errors, camera) if fit else partial(reprojection_errors, camera, pose)
+        comparison = compare(query, view, errors, tolerance)
+        with query.clock.stage("verify"):
             evidence = replace(
                 evidence,
                 inlier_ratio=comparison.inlier_ratio,
                 render_inlier_ratio=comparison.render_inlier_ratio,
+                explained_inlier_ratio=comparison.explained_inlier_ratio,
                 coverage=coverage(view.correspondences.a, camera.width, camera.height),
                 correlation=comparison.explained_correlation(0.5),
                 low_correlation=comparison.explained_correlation(0.25),
@@ -273,20 +282,19 @@ class _Candidate:
         return replace(self, evidence=evidence, reasons_against=verdict(evidence, limits))
 
     @property
-    def covariance(self) -> np.ndarray:
-        """Covariance (6, 6) of the pose: what the camera's errors would move it by is part of it."""
-        assert self.view.solution is not None
-        shift = self.camera_fit.pose_shift if self.camera_fit else np.zeros(6)
-        return self.view.solution.covariance + np.outer(shift, shift)
+    def pose(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """The pose (4, 4) with its covariance (6, 6), by the camera as the photo shows it; None for none."""
+        answer = self.camera_fit or self.view.solution
+        return answer and (answer.T_map_camera, answer.covariance)
 
     def trace(self, photo: Photo, search: Search, rivals: Sequence[_Candidate] = ()) -> Trace:
         """Return the estimate that this is, after a search, unless `rivals` explain the photo equally well."""
         view, evidence = self.view, search.counted(self.evidence)
         if rivals:
-            poses = tuple(c.view.solution.T_map_camera for c in (self, *rivals) if c.view.solution)
+            poses = tuple(c.pose[0] for c in (self, *rivals) if c.pose)
             reason = f"{len(poses)} places explain the photo equally well: send another image, or a prior"
             estimate = Estimate(Status.AMBIGUOUS, reason, evidence=evidence, candidates=poses)
-        elif self.reasons_against or view.solution is None:
+        elif self.reasons_against or self.pose is None:
             reason = f"the pose found is not believed: {self.reasons_against[0]}"
             estimate = Estimate(Status.REJECTED, reason, evidence=evidence)
         else:
@@ -294,8 +302,7 @@ class _Candidate:
                 Status.LOCALIZED,
                 f"{evidence.inliers} inliers of {evidence.lifted} corners, correlation {evidence.correlation:.2f}; "
                 f"{evidence.changed:.0%} of the photo is not as in the map",
-                view.solution.T_map_camera,
-                self.covariance,
+                *self.pose,
                 evidence,
             )
         changed = partial(changed_mask, photo, view) if view.solution else None

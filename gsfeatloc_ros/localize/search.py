@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import islice
 
 import numpy as np
@@ -37,6 +37,8 @@ _MAX_FOLLOWED_HINTS = 12
 _VIEWS_AFTER_INDEX = 8
 # Poses from which the same points are seen at least so many pixels apart are different places.
 _MIN_DISTANCE_OF_RIVALS = 40.0
+# From a pose that is nearer to one that was refined tracking leads there again: pixels of a photo SEARCH_WIDTH wide.
+_MIN_DISTANCE_OF_TRIES = 10.0
 # Of the views that are looked at together, the best of this many are followed.
 _MAX_FOLLOWED_VIEWS = 2
 # Views are chosen from this many random ones for each that is looked at.
@@ -64,6 +66,12 @@ class Search:
         self.best: MatchedView | None = None
         self.views = self.searched = self._around = 0
         self._pending: list[tuple[float, int, Hint]] = []
+        self._tried: list[_Place] = []
+
+    def tried(self, view: MatchedView) -> None:
+        """Take note of what a pose led to, a view of the photo: no other pose that would lead there is yielded."""
+        if view.solution is not None:
+            self._tried.append(_Place.of(view))
 
     def poses(self) -> Iterator[np.ndarray]:
         """Yield poses (4, 4) of the photo, as long as one is asked for and views are left."""
@@ -71,7 +79,8 @@ class Search:
             yield from self._look([self._prior.pose])
         if self._small.components.index is not None:
             yield from self._indexed()
-        if self._prior is not None:
+        # Once a pose was refined, and is refused, others near the prior are no better.
+        if self._prior is not None and not self._tried:
             poses = self._spread(self._prior)
             for start in range(0, len(poses), _BATCH):
                 batch = poses[start : start + _BATCH]
@@ -103,23 +112,23 @@ class Search:
         index, features, camera = self._small.components.index, self._small.features, self._small.photo.camera
         if index is None or found.solution is None or not isinstance(features, Features):
             return
-        places = [found.solution.T_map_camera]
-        seen = transform(invert(places[0]), found.found.points[found.solution.inliers])
-        elsewhere = [motion @ places[0] for motion in index.look_alikes]
+        place = _Place.of(found)
+        places = [place]
+        elsewhere = [motion @ place.pose for motion in index.look_alikes]
         if self.searched == 0:
             # It was found at the prior, and stands by it, unless the prior holds others for possible too.
             elsewhere = [pose for pose in elsewhere if self._likely(pose)]
         else:
             with self._small.clock.stage("search"):
-                elsewhere += poses_elsewhere(index, camera, features.on_host(), places[0])
+                elsewhere += poses_elsewhere(index, camera, features.on_host(), place.pose)
 
         def is_known(pose: np.ndarray) -> bool:
-            return any(_offset(camera, seen, pose, place) < _MIN_DISTANCE_OF_RIVALS for place in places)
+            return any(known.offset(camera, pose) < _MIN_DISTANCE_OF_RIVALS for known in places)
 
         for hint in elsewhere:
             pose = None if is_known(hint) else self._confirmed(hint)
             if pose is not None and not is_known(pose):
-                places.append(pose)
+                places.append(_Place(pose, place.seen))
                 yield pose
 
     def _spread(self, prior: Prior) -> list[np.ndarray]:
@@ -135,9 +144,10 @@ class Search:
         self._saw(looked[0], len(looked))
         for hint in promising(looked):
             assert hint.solution is not None
-            strong = hint.inliers >= STRONG_HINT
-            pose = hint.solution.T_map_camera if strong else self._confirmed(hint.solution.T_map_camera)
-            if pose is not None:
+            pose: np.ndarray | None = hint.solution.T_map_camera
+            if hint.inliers < STRONG_HINT:
+                pose = self._confirmed(hint.solution.T_map_camera)
+            if pose is not None and not self._was_tried(pose):
                 yield pose
 
     def _indexed(self) -> Iterator[np.ndarray]:
@@ -170,11 +180,17 @@ class Search:
                 return
             _, _, hint = heapq.heappop(self._pending)
             pose = self._confirmed(hint.pose)
-            if pose is not None:
+            if pose is not None and not self._was_tried(pose):
                 yield pose
+
+    def _was_tried(self, pose: np.ndarray) -> bool:
+        camera = self._small.photo.camera
+        return any(place.offset(camera, pose) < _MIN_DISTANCE_OF_TRIES for place in self._tried)
 
     def _confirmed(self, pose: np.ndarray) -> np.ndarray | None:
         """Return the pose (4, 4) of the photo by a render at a suggested one; None where too little agrees."""
+        if self._was_tried(pose):
+            return None
         view = self._small.match(pose)
         self._saw(view, 1)
         return view.solution.T_map_camera if view.solution and view.inliers >= CONFIRMED_HINT else None
@@ -185,16 +201,27 @@ class Search:
             self.best = view
 
 
-def _offset(camera: Camera, seen: np.ndarray, a: np.ndarray, b: np.ndarray) -> float:
-    """Return how far apart two poses (4, 4) are, in pixels in the median, by points (N, 3) in the camera frame of `b`.
+@dataclass(frozen=True, eq=False)
+class _Place:
+    """A pose (4, 4), and points (N, 3) that are seen from there, in its camera frame."""
 
-    It is infinite where most of them are behind `a`.
-    """
-    there = transform(invert(a) @ b, seen)
-    ahead = there[:, 2] > 0
-    if ahead.sum() < 0.5 * len(seen):
-        return float("inf")
-    return float(np.median(np.linalg.norm(camera.project(there[ahead]) - camera.project(seen[ahead]), axis=1)))
+    pose: np.ndarray
+    seen: np.ndarray
+
+    @classmethod
+    def of(cls, view: MatchedView) -> _Place:
+        """Return the pose that a view gave, which has a solution, with what its inliers show."""
+        assert view.solution is not None
+        pose = view.solution.T_map_camera
+        return cls(pose, transform(invert(pose), view.found.points[view.solution.inliers]))
+
+    def offset(self, camera: Camera, pose: np.ndarray) -> float:
+        """Return how far off the points are from a pose (4, 4), in pixels in the median; infinite with most behind."""
+        there = transform(invert(pose) @ self.pose, self.seen)
+        ahead = there[:, 2] > 0
+        if ahead.sum() < 0.5 * len(self.seen):
+            return float("inf")
+        return float(np.median(np.linalg.norm(camera.project(there[ahead]) - camera.project(self.seen[ahead]), axis=1)))
 
 
 def look(query: Query, poses: Sequence[np.ndarray]) -> list[MatchedView]:

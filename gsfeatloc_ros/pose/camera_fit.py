@@ -7,21 +7,27 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsfeatloc_ros.common.camera import Camera
-from gsfeatloc_ros.common.geometry import make_pose, skew, so3_exp, so3_log
+from gsfeatloc_ros.common.geometry import invert, make_pose, skew, so3_exp, transform
 from gsfeatloc_ros.pose.solve import Correspondences, PoseOptions, shared_variance, whiten
 
 # Parameters beside the pose: focal length (relative), k1, and by how much the camera turns, in radians about its axes,
-# while the shutter runs from the first row to the last. What they are known to before a photo is seen, as standard
-# deviations: what photos do not show stays near zero.
-_PRIOR_SIGMAS = np.array([0.05, 0.1, 0.03, 0.03, 0.03])
-# Steps are taken until what they change, in these deviations, is less than a thousandth.
+# while the shutter runs from the first row to the last. Each is zero by the calibration, with a standard deviation.
+# To see whether the calibration is of this camera at all: so wide that what photos do not show stays near zero.
+_ANY_CAMERA = np.array([0.05, 0.1, 0.03, 0.03, 0.03])
+# How far a calibration in use is off: what the covariance allows for.
+_CALIBRATED = np.array([0.002, 0.005, 0.0015, 0.0015, 0.0015])
+# What the pose itself keeps to, unless the photo contradicts it. The focal length it keeps to in any case: it can
+# hardly be told from the distance, and a calibration is better than what one photo says.
+_EXACT = np.array([1e-5, 0.001, 0.0005, 0.0005, 0.0005])
+_CONTRADICTED = np.array([False, True, True, True, True])
+# Steps are taken until what they change, in standard deviations, is less than a thousandth.
 _MAX_ITERATIONS = 6
 _MIN_STEP = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class CameraFit:
-    """How a camera differs from its calibration, by one photo.
+    """How a camera differs from its calibration, by one photo, and the photo's pose with that taken into account.
 
     Attributes:
         focal: how much longer the focal length is, relative.
@@ -30,7 +36,9 @@ class CameraFit:
         k1_sigma: its standard deviation.
         rolling: (3,) rotation vector of the camera, in its own axes and radians, from the first row to the last.
         rolling_sigma: (3,) its standard deviations.
-        pose_shift: (6,) what the pose would be moved by, translation and rotation vector about the map's axes.
+        T_map_camera: (4, 4) pose, of the middle row.
+        covariance: (6, 6) of it, as that of a PoseSolution; what the camera may be off by is part of it.
+        followed: (5,) of focal, k1 and rolling what the pose follows.
     """
 
     focal: float
@@ -39,13 +47,27 @@ class CameraFit:
     k1_sigma: float
     rolling: np.ndarray
     rolling_sigma: np.ndarray
-    pose_shift: np.ndarray
+    T_map_camera: np.ndarray
+    covariance: np.ndarray
+    followed: np.ndarray
+
+    def reprojection_errors(self, camera: Camera, found: Correspondences) -> np.ndarray:
+        """Return the distances (M,) in pixels between pixels and points seen by this camera; inf behind it."""
+        errors = np.full(len(found.pixels), np.inf)
+        ahead = transform(invert(self.T_map_camera), found.points)[:, 2] > 0
+        linear = _linearize(camera, self.T_map_camera, self.followed, found.select(ahead))
+        if linear is not None:
+            errors[ahead] = np.linalg.norm(linear[0], axis=1)
+        return errors
 
 
 def fit_camera(
     camera: Camera, T_map_camera: np.ndarray, found: Correspondences, options: PoseOptions
 ) -> CameraFit | None:
     """Fit the camera along with the pose, by Gauss-Newton on the whitened residuals with Cauchy's weights.
+
+    What the photo says of the camera decides how far the pose follows: a parameter's variance is what its estimate
+    exceeds its own uncertainty by (empirical Bayes; automatic relevance determination, MacKay, 1994).
 
     The principal point is no part of it: it cannot be told from a rotation.
 
@@ -58,48 +80,46 @@ def fit_camera(
     Returns:
         The fit; None where the matches do not determine it.
     """
-    pose, extra = T_map_camera, np.zeros(len(_PRIOR_SIGMAS))
-    information = np.concatenate([np.zeros(6), 1.0 / _PRIOR_SIGMAS**2])
-    whitening = whiten(camera, pose, found)
-    if whitening is None:
-        return None
+    start = _State(T_map_camera, np.zeros(len(_ANY_CAMERA)))
+    problem = _Problem.at(camera, found, options, start)
     try:
-        for _ in range(_MAX_ITERATIONS):
-            linear = _linearize(camera, pose, extra, found)
-            if linear is None:
-                return None
-            system = _weigh(*linear, whitening, options)
-            hessian = system.hessian + np.diag(information)
-            step = -np.linalg.solve(hessian, system.gradient + information * np.concatenate([np.zeros(6), extra]))
-            pose = make_pose(so3_exp(step[3:6]) @ pose[:3, :3], pose[:3, 3] + step[:3])
-            extra = extra + step[6:]
-            if np.abs(step[6:] / _PRIOR_SIGMAS).max() < _MIN_STEP:
-                break
-        sigmas = np.sqrt(np.diag(_covariance(system, information, found, options)))[6:]
+        free = problem and problem.solve(start, _ANY_CAMERA)
+        # The keypoints' noise is what is left once the camera's errors are explained.
+        problem = free and _Problem.at(camera, found, options, free)
+        if free is None or problem is None:
+            return None
+        sigmas = np.sqrt(np.diag(problem.covariance(free, _ANY_CAMERA)))[6:]
+        excess = np.sqrt(np.maximum(free.camera**2 - sigmas**2, 0.0))
+        kept = problem.solve(free, np.clip(np.where(_CONTRADICTED, excess, 0.0), _EXACT, _ANY_CAMERA))
+        if kept is None:
+            return None
+        # What a calibration in use would move the pose by is not known better than that.
+        shift = problem.step(kept, _CALIBRATED)[:6]
+        covariance = problem.covariance(kept, _CALIBRATED)[:6, :6] + np.outer(shift, shift)
     except np.linalg.LinAlgError:
         return None
-    shift = np.concatenate([pose[:3, 3] - T_map_camera[:3, 3], so3_log(pose[:3, :3] @ T_map_camera[:3, :3].T)])
-    if not (np.isfinite(sigmas).all() and np.isfinite(shift).all()):
+    if not (np.isfinite(sigmas).all() and np.isfinite(covariance).all() and np.linalg.eigvalsh(covariance)[0] > 0):
         return None
-    (focal, k1), (focal_sigma, k1_sigma) = extra[:2].tolist(), sigmas[:2].tolist()
-    return CameraFit(focal, focal_sigma, k1, k1_sigma, extra[2:], sigmas[2:], shift)
+    (focal, k1), (focal_sigma, k1_sigma) = free.camera[:2].tolist(), sigmas[:2].tolist()
+    return CameraFit(focal, focal_sigma, k1, k1_sigma, free.camera[2:], sigmas[2:], kept.pose, covariance, kept.camera)
 
 
-def _covariance(system: _System, information: np.ndarray, found: Correspondences, options: PoseOptions) -> np.ndarray:
-    """Return the covariance (11, 11) of pose and camera, with what the matches have in common, as of a pose."""
-    size, weights = len(information), system.weights
-    inflation = max((weights * system.squared).sum() / max(2 * weights.sum() - size, 1.0), 1.0)
-    weighted = (weights[:, None, None] * system.jacobian).reshape(-1, size)
-    of_a_match = weighted.T @ system.jacobian.reshape(-1, size) / weights.sum()
-    shared = shared_variance(found.pixels, system.residuals, options)
-    # What they have in common counts as one match with that error, beside what is known before.
-    own = np.linalg.inv(system.hessian + np.diag(information))
-    return inflation * own + np.linalg.inv(of_a_match / shared + np.diag(information))
+@dataclass(frozen=True, eq=False)
+class _State:
+    """A pose T_map_camera (4, 4), and the camera's parameters (5,)."""
+
+    pose: np.ndarray
+    camera: np.ndarray
+
+    def moved(self, step: np.ndarray) -> _State:
+        """Return the state after a step (11,)."""
+        rotation, translation = self.pose[:3, :3], self.pose[:3, 3]
+        return _State(make_pose(so3_exp(step[3:6]) @ rotation, translation + step[:3]), self.camera + step[6:])
 
 
 @dataclass(frozen=True, eq=False)
 class _System:
-    """The robust least squares problem at a pose and camera: residuals (M, 2), Jacobians (M, 2, 11), what follows."""
+    """The robust least squares problem at a state: residuals (M, 2), Jacobians (M, 2, 11), and what follows."""
 
     residuals: np.ndarray
     jacobian: np.ndarray
@@ -109,16 +129,78 @@ class _System:
     gradient: np.ndarray
 
 
-def _weigh(residuals: np.ndarray, jacobian: np.ndarray, whitening: np.ndarray, options: PoseOptions) -> _System:
-    """Return the whitened problem with Cauchy's weights (iteratively reweighted least squares)."""
-    white = np.einsum("mij,mj->mi", whitening, residuals)
-    white_jacobian = whitening @ jacobian
-    squared = (white**2).sum(axis=1)
-    weights = 1.0 / (1.0 + squared / options.cauchy_scale**2)
-    size = jacobian.shape[2]
-    weighted = (weights[:, None, None] * white_jacobian).reshape(-1, size)
-    hessian = weighted.T @ white_jacobian.reshape(-1, size)
-    return _System(residuals, jacobian, squared, weights, hessian, weighted.T @ white.ravel())
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """Matches to be explained by a pose and a camera that is about as calibrated.
+
+    Deviations (5,) are standard deviations of the camera's parameters before the photo is seen.
+    """
+
+    calibrated: Camera
+    found: Correspondences
+    whitening: np.ndarray
+    options: PoseOptions
+
+    @classmethod
+    def at(cls, camera: Camera, found: Correspondences, options: PoseOptions, state: _State) -> _Problem | None:
+        """Return the problem with the keypoints' noise as measured at a state; None where points are behind it."""
+        linear = _linearize(camera, state.pose, state.camera, found)
+        whitening = None if linear is None else whiten(camera, state.pose, found, linear[0])
+        return None if whitening is None else cls(camera, found, whitening, options)
+
+    def solve(self, start: _State, deviations: np.ndarray) -> _State | None:
+        """Return the most likely state; None where points get behind the camera."""
+        state = start
+        for _ in range(_MAX_ITERATIONS):
+            step = self.step(state, deviations)
+            if not np.isfinite(step).all():
+                return None
+            state = state.moved(step)
+            if np.abs(step[6:] / _ANY_CAMERA).max() < _MIN_STEP:
+                break
+        return state if np.isfinite(state.pose).all() else None
+
+    def step(self, state: _State, deviations: np.ndarray) -> np.ndarray:
+        """Return the step (11,) to the most likely state of the linearized problem; NaN with points behind."""
+        system = self._system(state)
+        if system is None:
+            return np.full(11, np.nan)
+        information = _information(deviations)
+        known = information * np.concatenate([np.zeros(6), state.camera])
+        return -np.linalg.solve(system.hessian + np.diag(information), system.gradient + known)
+
+    def covariance(self, state: _State, deviations: np.ndarray) -> np.ndarray:
+        """Return the covariance (11, 11) of pose and camera, with what the matches have in common, as of a pose."""
+        system, known = self._system(state), np.diag(_information(deviations))
+        if system is None:
+            return np.full((11, 11), np.nan)
+        weights = system.weights
+        inflation = max((weights * system.squared).sum() / max(2 * weights.sum() - len(known), 1.0), 1.0)
+        weighted = (weights[:, None, None] * system.jacobian).reshape(-1, len(known))
+        of_a_match = weighted.T @ system.jacobian.reshape(-1, len(known)) / weights.sum()
+        shared = shared_variance(self.found.pixels, system.residuals, self.options)
+        # What they have in common counts as one match with that error, beside what is known before.
+        return inflation * np.linalg.inv(system.hessian + known) + np.linalg.inv(of_a_match / shared + known)
+
+    def _system(self, state: _State) -> _System | None:
+        """Return the whitened problem with Cauchy's weights (iteratively reweighted least squares)."""
+        linear = _linearize(self.calibrated, state.pose, state.camera, self.found)
+        if linear is None:
+            return None
+        residuals, jacobian = linear
+        white = np.einsum("mij,mj->mi", self.whitening, residuals)
+        white_jacobian = self.whitening @ jacobian
+        squared = (white**2).sum(axis=1)
+        weights = 1.0 / (1.0 + squared / self.options.cauchy_scale**2)
+        size = jacobian.shape[2]
+        weighted = (weights[:, None, None] * white_jacobian).reshape(-1, size)
+        hessian = weighted.T @ white_jacobian.reshape(-1, size)
+        return _System(residuals, jacobian, squared, weights, hessian, weighted.T @ white.ravel())
+
+
+def _information(deviations: np.ndarray) -> np.ndarray:
+    """Return what is known (11,) of pose and camera before the photo is seen."""
+    return np.concatenate([np.zeros(6), 1.0 / deviations**2])
 
 
 def _linearize(

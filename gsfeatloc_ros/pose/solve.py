@@ -264,10 +264,12 @@ def shared_variance(pixels: np.ndarray, residuals: np.ndarray, options: PoseOpti
     return options.shared_error**2 + options.shared_share * max(alike, 0.0)
 
 
-def whiten(camera: Camera, T_map_camera: np.ndarray, found: Correspondences) -> np.ndarray | None:
-    """Return matrices (M, 2, 2) that whiten the residuals at a pose (4, 4); None where a point is not ahead of it."""
+def whiten(
+    camera: Camera, T_map_camera: np.ndarray, found: Correspondences, residuals: np.ndarray
+) -> np.ndarray | None:
+    """Return matrices (M, 2, 2) that whiten residuals (M, 2) at a pose (4, 4); None with points that are not ahead."""
     linear = _linearize(camera, T_map_camera, found)
-    return None if linear is None else _whitening(linear.residuals, _apply(linear.by_point, found.sigmas))
+    return None if linear is None else _whitening(residuals, _apply(linear.by_point, found.sigmas))
 
 
 class _Linear(NamedTuple):

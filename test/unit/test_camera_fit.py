@@ -6,32 +6,31 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.geometry import invert, make_pose, so3_exp, so3_log, transform
-from gsfeatloc_ros.pose.camera_fit import _linearize, fit_camera
-from gsfeatloc_ros.pose.solve import Correspondences, PoseOptions, solve_pose
+from gsfeatloc_ros.pose.camera_fit import CameraFit, _linearize, fit_camera
+from gsfeatloc_ros.pose.solve import Correspondences, PoseOptions, PoseSolution, solve_pose
 
 CAMERA = Camera(640, 480, np.array([[600.0, 0, 315], [0, 610.0, 245], [0, 0, 1]]))
 POSE = make_pose(so3_exp(np.array([0.4, -1.1, 0.3])), np.array([2.0, -1.0, 0.5]))
 ROLLING = np.array([0.004, -0.012, 0.006])
 
 
-def seen(camera: Camera, k1: float = 0.0, rolling: np.ndarray | None = None, noise: float = 0.3) -> Correspondences:
+def seen(camera: Camera, k1: float = 0.0, rolling: np.ndarray | None = None, seed: int = 0) -> Correspondences:
     """What a camera at POSE sees of random points, rows one after another where it is turned by `rolling` meanwhile."""
-    rng = np.random.default_rng(0)
+    rng = np.random.default_rng(seed)
     points = transform(POSE, CAMERA.rays(rng.uniform([0, 0], [639, 479], (600, 2))) * rng.uniform(2, 8, (600, 1)))
     pixels = np.full((600, 2), 240.0)
-    for _ in range(5):  # the row at which a point is read depends on where it is seen
-        when = (pixels[:, 1] + 0.5) / camera.height - 0.5
-        turned = [
-            POSE @ make_pose(so3_exp(t * (np.zeros(3) if rolling is None else rolling)), np.zeros(3)) for t in when
-        ]
-        in_camera = np.array([transform(invert(T), p[None])[0] for T, p in zip(turned, points, strict=True)])
+    for _ in range(1 if rolling is None else 5):  # the row at which a point is read depends on where it is seen
+        when = (pixels[:, 1:] + 0.5) / camera.height - 0.5
+        turned = Rotation.from_rotvec(when * (np.zeros(3) if rolling is None else rolling))
+        in_camera = turned.inv().apply(transform(invert(POSE), points))
         slopes = in_camera[:, :2] / in_camera[:, 2:]
         slopes = slopes * (1 + k1 * (slopes**2).sum(axis=1, keepdims=True))
         pixels = slopes * camera.K[[0, 1], [0, 1]] + camera.K[:2, 2]
-    return Correspondences(pixels + noise * rng.normal(size=pixels.shape), points, np.zeros_like(points))
+    return Correspondences(pixels + 0.3 * rng.normal(size=pixels.shape), points, np.zeros_like(points))
 
 
 def fitted(found: Correspondences):
@@ -53,25 +52,54 @@ def test_a_right_calibration_reads_as_right() -> None:
 
 @pytest.mark.parametrize("error", [-0.1, -0.02, 0.01, 0.05])
 def test_the_focal_length_is_told(error: float) -> None:
-    fit, solution = fitted(seen(longer(error)))
+    fit, _ = fitted(seen(longer(error)))
     assert fit.focal == pytest.approx(error, abs=0.003)
     assert 0 < fit.focal_sigma < 0.01
-    # What the pose would be moved by is what it is off by.
-    moved = make_pose(
-        so3_exp(fit.pose_shift[3:]) @ solution.T_map_camera[:3, :3], solution.T_map_camera[:3, 3] + fit.pose_shift[:3]
-    )
-    off = np.linalg.norm(solution.T_map_camera[:3, 3] - POSE[:3, 3])
-    assert np.linalg.norm(moved[:3, 3] - POSE[:3, 3]) < 0.2 * off
+    # The pose keeps to the calibration.
+    assert abs(fit.followed[0]) < 1e-4
 
 
-def test_radial_distortion_is_told() -> None:
-    fit, _ = fitted(seen(CAMERA, k1=-0.05))
+def test_radial_distortion_is_told_and_followed() -> None:
+    fit, solution = fitted(seen(CAMERA, k1=-0.05))
     assert fit.k1 == pytest.approx(-0.05, abs=0.01)
+    assert off(fit) < 0.3 * off(solution)
 
 
-def test_a_rolling_shutter_is_told() -> None:
-    fit, _ = fitted(seen(CAMERA, rolling=ROLLING))
+def test_a_rolling_shutter_is_told_and_followed() -> None:
+    found = seen(CAMERA, rolling=ROLLING)
+    fit, solution = fitted(found)
     np.testing.assert_allclose(fit.rolling, ROLLING, atol=1.5e-3)
+    assert off(fit) < 0.3 * off(solution)
+    assert np.median(fit.reprojection_errors(CAMERA, found)) < 0.5 < np.median(solution.errors)
+
+
+def off(answer: CameraFit | PoseSolution) -> float:
+    """How far an answer is from POSE, with a radian for a unit."""
+    turn = so3_log(POSE[:3, :3] @ answer.T_map_camera[:3, :3].T)
+    return float(np.linalg.norm(np.concatenate([answer.T_map_camera[:3, 3] - POSE[:3, 3], turn])))
+
+
+@pytest.mark.parametrize(
+    ("error", "k1", "turn"), [(0.0, 0.0, 0.0), (0.002, 0.0, 0.0), (0.0, -0.01, 0.0), (0.0, 0.0, 1)]
+)
+def test_the_covariance_allows_for_what_a_calibration_in_use_is_off_by(error: float, k1: float, turn: float) -> None:
+    squares = []
+    for seed in range(20):
+        found = seen(longer(error), k1=k1, rolling=0.2 * turn * ROLLING, seed=seed)
+        fit, _ = fitted(found)
+        rotation = so3_log(POSE[:3, :3] @ fit.T_map_camera[:3, :3].T)
+        deviation = np.concatenate([POSE[:3, 3] - fit.T_map_camera[:3, 3], rotation])
+        squares.append(deviation @ np.linalg.solve(fit.covariance, deviation) / 6)
+    assert np.mean(squares) < 1.2
+
+
+def test_what_is_behind_the_camera_is_infinitely_far_off() -> None:
+    found = seen(CAMERA)
+    fit, _ = fitted(found)
+    found.points[0] = transform(POSE, np.array([[0, 0, -1.0]]))[0]
+    errors = fit.reprojection_errors(CAMERA, found)
+    assert np.isinf(errors[0])
+    assert np.isfinite(errors[1:]).all()
 
 
 def test_jacobians_equal_finite_differences() -> None:
@@ -95,13 +123,7 @@ def test_points_behind_the_camera_are_no_fit() -> None:
     assert fit_camera(CAMERA, POSE, found, PoseOptions()) is None
 
 
-def test_the_shift_is_in_the_axes_of_the_map() -> None:
-    fit, solution = fitted(seen(longer(0.03)))
-    step = so3_log(POSE[:3, :3] @ solution.T_map_camera[:3, :3].T)
-    assert np.linalg.norm(fit.pose_shift[3:] - step) < 0.002
-
-
 def test_matches_that_determine_no_pose_are_no_fit() -> None:
     found = Correspondences(np.full((30, 2), 100.0), np.full((30, 3), 5.0), np.zeros((30, 3)))
     fit = fit_camera(CAMERA, make_pose(np.eye(3), np.zeros(3)), found, PoseOptions())
-    assert fit is None or np.isfinite(fit.pose_shift).all()
+    assert fit is None or np.isfinite(fit.covariance).all()

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import cv2
 import numpy as np
@@ -15,6 +17,7 @@ from gsfeatloc_ros.localize.comparison import CELLS, Comparison, changed_mask, c
 from gsfeatloc_ros.localize.options import LocalizerOptions
 from gsfeatloc_ros.localize.query import Components, MatchedView, Query
 from gsfeatloc_ros.match import create_matcher, create_tracker
+from gsfeatloc_ros.pose.solve import Correspondences, reprojection_errors
 from gsfeatloc_ros.render import create_renderer
 
 
@@ -27,7 +30,13 @@ def compared(components, image: np.ndarray, camera: Camera, pose: np.ndarray) ->
     """A photo compared with the map seen from a pose."""
     query = Query(components, Photo.undistorted(image, camera, 640), StageClock())
     view = query.track(pose)
-    return compare(query, view, 3.0), query, view
+    return compare(query, view, errors(query.photo.camera, view), 3.0), query, view
+
+
+def errors(camera: Camera, view: MatchedView) -> Callable[[Correspondences], np.ndarray]:
+    """By how much correspondences are off from the solution of a view."""
+    assert view.solution is not None
+    return partial(reprojection_errors, camera, view.solution.T_map_camera)
 
 
 def covered(image: np.ndarray) -> np.ndarray:
@@ -71,6 +80,18 @@ def test_what_is_covered_is_told_apart(components, room_camera, room_photos) -> 
     assert inside.mean() > 0.7
     assert outside.mean() < 0.1
     assert 0.15 < comparison.changed_share() < 0.45
+    # Corners on the cover count against the whole, not against what is as in the map.
+    assert comparison.explained_inlier_ratio > 0.97 > comparison.inlier_ratio
+
+
+def test_what_disagrees_among_what_agrees_is_told_apart() -> None:
+    agreeing, disagreeing, correlation = np.full((12, 16), 8), np.full((12, 16), 2), np.full((12, 16), 0.9)
+    scattered = Comparison(0.8, 0.8, agreeing, disagreeing, correlation)
+    assert scattered.explained_inlier_ratio == pytest.approx(0.8, abs=1e-3)
+    # The same numbers, all of what disagrees in one part.
+    agreeing[:, 13:], disagreeing[:, :13], correlation[:, 13:] = 0, 0, 0.1
+    assert Comparison(0.8, 0.8, agreeing, disagreeing, correlation).explained_inlier_ratio > 0.999
+    assert np.isnan(Comparison(0.0, 0.0, 0 * agreeing, disagreeing, correlation).explained_inlier_ratio)
 
 
 def test_the_same_in_a_small_photo(components, room_camera, room_photos) -> None:
@@ -88,7 +109,8 @@ def test_a_blank_photo_has_nothing_to_compare(components, room_camera, room_phot
     blank = replace(query.photo, image=np.full_like(query.photo.image, 128))
     view = replace(view, image=np.full_like(query.photo.image, 128))
     assert not changed_mask(blank, view).any()
-    comparison = compare(replace(query, photo=blank), view, 3.0)
+    comparison = compare(replace(query, photo=blank), view, errors(query.photo.camera, view), 3.0)
+    assert np.isnan(comparison.explained_inlier_ratio)
     assert np.isnan(comparison.correlation).all()
     assert np.isnan(comparison.explained_correlation(0.5))
     assert np.isnan(comparison.changed_share())

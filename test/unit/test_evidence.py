@@ -21,6 +21,7 @@ GOOD = Evidence(
     inliers=590,
     inlier_ratio=0.99,
     render_inlier_ratio=0.98,
+    explained_inlier_ratio=0.99,
     coverage=0.8,
     correlation=0.95,
     low_correlation=0.9,
@@ -30,7 +31,7 @@ GOOD = Evidence(
     blur_px=0.0,
     focal_error=0.002,
     focal_sigma=0.003,
-    probability_wrong=1e-9,
+    probability_wrong=0.99e-12,
     passes=2,
     views=3,
 )
@@ -61,12 +62,26 @@ def test_each_limit_is_exact_and_named(name: str, limit: float, beyond: float, s
     [(8.0001, ", for the pose is 8.0 standard deviations from the prior"), (float("nan"), " without a prior")],
 )
 def test_a_pose_that_no_prior_expects_must_be_much_surer(deviation: float, says: str) -> None:
-    sure = replace(GOOD, probability_wrong=1e-9, deviation=deviation)
+    sure = replace(GOOD, probability_wrong=0.99e-12, deviation=deviation)
     assert verdict(sure, Limits()) == ()
     unsure = replace(sure, probability_wrong=1.01e-9)
     (reason,) = verdict(unsure, Limits())
     assert f"(at most 1e-09{says})" in reason
     assert verdict(replace(unsure, deviation=8.0), Limits()) == ()
+
+
+@pytest.mark.parametrize("deviation", [9.0, float("nan")])
+def test_a_pose_that_no_prior_expects_must_explain_most_of_the_photo(deviation: float) -> None:
+    assert verdict(replace(GOOD, changed=0.4, deviation=deviation), Limits()) == ()
+    assert verdict(replace(GOOD, changed=0.7, deviation=8.0), Limits()) == ()
+    (reason,) = verdict(replace(GOOD, changed=0.71, deviation=8.0), Limits())
+    assert "71% of the photo is not as in the map (at most 70%)" in reason
+    for changed in (0.41, float("nan")):
+        unexpected = replace(GOOD, changed=changed, deviation=deviation)
+        (reason,) = verdict(unexpected, Limits())
+        assert "of the photo is not as in the map (at most 40%" in reason
+        # Its mirror image says nothing of that.
+        assert verdict(replace(unexpected, mirror_probability_wrong=1.0), Limits()) == (reason,)
 
 
 @pytest.mark.parametrize("deviation", [9.0, float("nan")])
@@ -76,7 +91,7 @@ def test_the_mirror_image_decides_on_a_pose_that_no_prior_expects(deviation: flo
     nothing, better = (replace(unsure, mirror_probability_wrong=p) for p in (1.0, 1e-5))
     assert verdict(nothing, Limits()) == ()
     (reason,) = verdict(better, Limits())
-    assert "(at most 1e-09, for the photo's mirror image fits about as well: is the image flipped?)" in reason
+    assert "(at most 1e-12, for the photo's mirror image fits about as well: is the image flipped?)" in reason
     # It was asked already; it is not to be asked of what is sure, too risky, or refused all the same.
     for decided in (nothing, better, replace(GOOD, deviation=deviation)):
         assert not is_uncertain(decided, Limits())
@@ -108,12 +123,12 @@ def test_numbers_and_texts_have_the_same_names() -> None:
     assert list(GOOD.numbers()) == list(GOOD.texts())
     assert GOOD.numbers()["inlier_ratio"] == 0.99
     texts = GOOD.texts()
-    assert (texts["corners"], texts["inlier_ratio"], texts["probability_wrong"]) == ("800", "0.990", "1.0e-09")
+    assert (texts["corners"], texts["inlier_ratio"], texts["probability_wrong"]) == ("800", "0.990", "9.9e-13")
     assert Evidence().texts()["correlation"] == "nan"
 
 
 @given(
-    name=st.sampled_from(["inlier_ratio", "render_inlier_ratio", "correlation", "low_correlation"]),
+    name=st.sampled_from(["explained_inlier_ratio", "correlation", "low_correlation"]),
     low=st.floats(0.3, 0.98),
     high=st.floats(0.3, 0.98),
 )
@@ -124,10 +139,10 @@ def test_more_agreement_never_makes_an_answer_less_probable(name: str, low: floa
 
 def test_probabilities_tell_what_was_seen_apart() -> None:
     """As measured: a right answer, one in a photo that is covered by 40 %, lego's worst mirror image, a wrong pose."""
-    right = replace(GOOD, inlier_ratio=0.98, render_inlier_ratio=0.98, correlation=0.94, low_correlation=0.88)
-    covered = replace(GOOD, inlier_ratio=0.9, render_inlier_ratio=0.92, correlation=0.94, low_correlation=0.88)
-    mirrored = replace(GOOD, inlier_ratio=0.95, render_inlier_ratio=0.92, correlation=0.82, low_correlation=0.74)
-    wrong = replace(GOOD, inlier_ratio=0.5, render_inlier_ratio=0.5, correlation=0.5, low_correlation=0.3)
+    right = replace(GOOD, explained_inlier_ratio=0.985, correlation=0.94, low_correlation=0.88)
+    covered = replace(GOOD, explained_inlier_ratio=0.98, correlation=0.91, low_correlation=0.83)
+    mirrored = replace(GOOD, explained_inlier_ratio=0.969, correlation=0.83, low_correlation=0.705)
+    wrong = replace(GOOD, explained_inlier_ratio=0.77, correlation=0.5, low_correlation=0.3)
     assert probability_wrong(right) < 1e-6
     assert probability_wrong(covered) < 1e-4 < 0.01 < probability_wrong(mirrored) < probability_wrong(wrong)
     assert probability_wrong(wrong) > 0.999
