@@ -64,9 +64,9 @@ def test_each_limit_is_exact_and_named(name: str, limit: float, beyond: float, s
 def test_a_pose_that_no_prior_expects_must_be_much_surer(deviation: float, says: str) -> None:
     sure = replace(GOOD, probability_wrong=0.99e-12, deviation=deviation)
     assert verdict(sure, Limits()) == ()
-    unsure = replace(sure, probability_wrong=1.01e-9)
+    unsure = replace(sure, probability_wrong=1.01e-12)
     (reason,) = verdict(unsure, Limits())
-    assert f"(at most 1e-09{says})" in reason
+    assert f"(at most 1e-12{says})" in reason
     assert verdict(replace(unsure, deviation=8.0), Limits()) == ()
 
 
