@@ -17,10 +17,12 @@ _COVERAGE_CELLS = (8, 6)
 # standard deviation.
 _MAX_FOCAL_ERROR = 0.01
 _FOCAL_SIGMAS = 2.0
-# Of a pose that no prior expects so many times the risk is taken, for a mirror image may be one; and of one that is so
-# many times less likely to be wrong than what the photo's mirror image suggests, all of it.
+# Of a pose that no prior expects this share of the risk is taken, for a mirror image may be one, unless it is so many
+# times less likely to be wrong than what the photo's mirror image suggests.
 _UNEXPECTED = 1e-8
 _MIRROR_IS_WORSE = 1e-2
+# And this share of one that a prior expects if the mirror image suggests what is less likely to be wrong.
+_MIRRORED = 1e-4
 # What is seen in a picture on a wall or in a mirror, or is one of several, may be somewhere else: at most this share of
 # the photo may be covered or changed, and less for a pose that no prior expects.
 _MAX_CHANGED = 0.7
@@ -153,7 +155,7 @@ def verdict(evidence: Evidence, limits: Limits) -> tuple[str, ...]:
     if evidence.inliers < limits.min_inliers:
         reasons.append(f"{evidence.counts} (at least {limits.min_inliers} needed)")
     # Written so that NaN is a reason.
-    max_risk = limits.max_risk * (1.0 if _is_expected(evidence, limits) else _UNEXPECTED)
+    max_risk = limits.max_risk * _share_of_risk(evidence, limits)
     if not evidence.probability_wrong <= max_risk:
         why = _why_so_little_risk(evidence, limits)
         reasons.append(
@@ -172,15 +174,17 @@ def verdict(evidence: Evidence, limits: Limits) -> tuple[str, ...]:
     return tuple(reasons)
 
 
-def _is_expected(evidence: Evidence, limits: Limits) -> bool:
-    """Return whether a pose is where the prior says, or fits the photo much better than its mirror image fits."""
-    mirror_is_worse = evidence.probability_wrong <= _MIRROR_IS_WORSE * evidence.mirror_probability_wrong
-    return evidence.deviation <= limits.max_deviation or mirror_is_worse
+def _share_of_risk(evidence: Evidence, limits: Limits) -> float:
+    """Return how much of the risk is taken with a pose, by the prior and the photo's mirror image."""
+    wrong, mirror_wrong = evidence.probability_wrong, evidence.mirror_probability_wrong
+    if evidence.deviation <= limits.max_deviation:
+        return _MIRRORED if mirror_wrong < wrong else 1.0
+    return 1.0 if wrong <= _MIRROR_IS_WORSE * mirror_wrong else _UNEXPECTED
 
 
 def _why_so_little_risk(evidence: Evidence, limits: Limits) -> str:
     """Return in words why less risk is taken with a pose; nothing for one with which all is."""
-    if _is_expected(evidence, limits):
+    if _share_of_risk(evidence, limits) == 1.0:
         return ""
     if evidence.mirror_probability_wrong < 1:
         return ", for the photo's mirror image fits about as well: is the image flipped?"
@@ -197,10 +201,11 @@ def _why_unexpected(evidence: Evidence, limits: Limits) -> str:
 
 
 def is_uncertain(evidence: Evidence, limits: Limits) -> bool:
-    """Return whether nothing but the photo's mirror image, which was not looked for yet, can decide on the pose."""
+    """Return whether the photo's mirror image, which was not looked for yet, decides on the pose."""
     if not math.isnan(evidence.mirror_probability_wrong):
         return False
-    return bool(verdict(evidence, limits)) and not verdict(replace(evidence, mirror_probability_wrong=1.0), limits)
+    best, worst = (verdict(replace(evidence, mirror_probability_wrong=wrong), limits) for wrong in (0.0, 1.0))
+    return bool(best) and not worst
 
 
 def focal_length_is_wrong(evidence: Evidence) -> bool:

@@ -95,8 +95,18 @@ def test_the_mirror_image_decides_on_a_pose_that_no_prior_expects(deviation: flo
     # It was asked already; it is not to be asked of what is sure, too risky, or refused all the same.
     for decided in (nothing, better, replace(GOOD, deviation=deviation)):
         assert not is_uncertain(decided, Limits())
-    for other in (replace(unsure, deviation=1.0), replace(unsure, inliers=5), replace(unsure, probability_wrong=0.01)):
+    for other in (replace(unsure, inliers=5), replace(unsure, probability_wrong=0.01)):
         assert not is_uncertain(other, Limits())
+
+
+def test_a_mirror_image_that_fits_better_decides_on_a_pose_that_a_prior_expects() -> None:
+    unsure, sure = replace(GOOD, probability_wrong=1e-6), replace(GOOD, probability_wrong=0.99e-8)
+    assert is_uncertain(unsure, Limits())
+    assert not is_uncertain(sure, Limits())
+    assert verdict(replace(unsure, mirror_probability_wrong=1.0e-6), Limits()) == ()
+    (reason,) = verdict(replace(unsure, mirror_probability_wrong=0.9e-6), Limits())
+    assert "(at most 1e-08, for the photo's mirror image fits about as well: is the image flipped?)" in reason
+    assert verdict(replace(sure, mirror_probability_wrong=1e-9), Limits()) == ()
 
 
 def test_limits_are_those_that_are_given() -> None:
