@@ -7,6 +7,8 @@ from typing import Any
 
 import yaml
 
+from gsfeatloc_ros.common.safe_files import open_regular
+
 # Of a file: no calibration, and nothing that people write, is larger.
 _MAX_BYTES = 1_000_000
 
@@ -16,10 +18,10 @@ def read_yaml(path: Path) -> Any:
 
     Raises:
         ValueError: it is no YAML; the message says why, in one line.
-        OSError: it cannot be read.
+        OSError: it cannot be read, or is a folder, a pipe, a device.
     """
     try:
-        with path.open("rb") as file:
-            return yaml.safe_load(file.read(_MAX_BYTES))
+        with open_regular(path) as stream:
+            return yaml.safe_load(stream.read(_MAX_BYTES))
     except (yaml.YAMLError, RecursionError) as error:
         raise ValueError(" ".join(str(error).split())) from error

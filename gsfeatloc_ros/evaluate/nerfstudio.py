@@ -83,7 +83,7 @@ def naming(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise ValueError(f"{path}: cannot be read: {error.strerror}") from error
+        raise ValueError(f"{path}: cannot be read: {error.strerror or error}") from error
     except KeyError as error:
         raise ValueError(f"{path}: lacks the key {error}") from error
     except (TypeError, ValueError, OverflowError, AttributeError) as error:

@@ -43,7 +43,7 @@ def read_priors(path: Path, scene: Scene) -> list[PhotoPrior]:
             if name in indices:
                 poses.append((indices[name], _pose(number, values)))
     except OSError as error:
-        raise ValueError(f"{path}: cannot be read: {error.strerror}") from error
+        raise ValueError(f"{path}: cannot be read: {error.strerror or error}") from error
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
     if not poses:

@@ -157,29 +157,27 @@ class LocalizerNode(LifecycleNode):
     @_logged
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Let go of the map."""
-        session = self._configured_session()
-        session.stop(_STOP_TIMEOUT)
-        session.close()
-        self._session = None
+        self._let_go()
         return TransitionCallbackReturn.SUCCESS
 
     @_logged
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Do the same, from whatever state."""
-        if self._session is None:
-            return TransitionCallbackReturn.SUCCESS
-        self._session.deactivate()
-        return self.on_cleanup(state)
+        self._let_go()
+        return TransitionCallbackReturn.SUCCESS
 
     @_logged
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Let go of what is left after a transition that failed: it can be configured again."""
+        self._let_go()
+        return TransitionCallbackReturn.SUCCESS
+
+    def _let_go(self) -> None:
         session, self._session = self._session, None
         if session is not None:
             session.deactivate()
             session.stop(_STOP_TIMEOUT)
             session.close()
-        return TransitionCallbackReturn.SUCCESS
 
     def _configured_session(self) -> Session:
         assert self._session is not None  # the lifecycle sees to it

@@ -14,16 +14,9 @@ from rclpy.parameter import Parameter as RosParameter
 
 from gsfeatloc_ros.common.parameter import Parameter
 from gsfeatloc_ros.common.words import in_one_line, shortened
+from gsfeatloc_ros.ros_io.old_parameters import RENAMED, RETIRED, notice
 from gsfeatloc_ros.ros_io.settings import PARAMETERS, Settings, nearest_name
 
-# Names that are accepted for one more release, though they have no effect, and what to set instead.
-_RETIRED = {
-    "localizer.min_inlier_ratio": "localizer.max_risk",
-    "localizer.min_correlation": "localizer.max_risk",
-    "localizer.min_agreement": "localizer.max_risk",
-}
-# Names that work for one more release, and what they are called now.
-_RENAMED = {"renderer.threads": "cpu.threads"}
 # Of parameters that rclpy declares with the topics.
 _QOS = "qos_overrides."
 
@@ -55,9 +48,9 @@ def declare_parameters(node: Node) -> Settings:
     """
     # rclpy has no other way to see what was given.
     given = node._parameter_overrides
-    for old, new in _RENAMED.items():
+    for old, new in RENAMED.items():
         if old in given:
-            node.get_logger().warning(f"parameter {old} is called {new} now: rename it")
+            node.get_logger().warning(notice(old))
             given.setdefault(new, RosParameter(new, value=given.pop(old).value))
     for parameter in PARAMETERS:
         if parameter.name in given:
@@ -66,8 +59,8 @@ def declare_parameters(node: Node) -> Settings:
         default = list(parameter.default) if isinstance(parameter.default, tuple) else parameter.default
         node.declare_parameter(parameter.name, default, descriptor(parameter))
     for name in given:
-        if name in _RETIRED:
-            _warn_of_retired(node, name)
+        if name in RETIRED:
+            node.get_logger().warning(notice(name))
         elif not node.has_parameter(name) and not name.startswith(_QOS):
             _warn_of_unknown(node, name)
     check_choices([node.get_parameter(name) for name in _BY_NAME])
@@ -93,12 +86,12 @@ def prepare_change(node: Node, parameters: Sequence[RosParameter]) -> list[RosPa
     """Return parameters that are about to be set, as they are declared; those without effect are warned of instead."""
     kept = []
     for parameter in parameters:
-        if parameter.name in _RETIRED:
-            _warn_of_retired(node, parameter.name)
+        if parameter.name in RETIRED:
+            node.get_logger().warning(notice(parameter.name))
         else:
             kept.append(_as_declared(parameter))
     # rclpy says that setting no parameter fails: what was to be set instead stays as it is.
-    return kept or [node.get_parameter(_RETIRED[parameter.name]) for parameter in parameters[:1]]
+    return kept or [node.get_parameter(RETIRED[parameter.name]) for parameter in parameters[:1]]
 
 
 def refuse_unreadable(node: Node) -> None:
@@ -150,10 +143,6 @@ def _as_declared(parameter: RosParameter) -> RosParameter:
     if declared is not None and parameter.type_ is RosParameter.Type.INTEGER_ARRAY:
         return RosParameter(parameter.name, value=list(declared.with_doubles(tuple(parameter.value))))
     return parameter
-
-
-def _warn_of_retired(node: Node, name: str) -> None:
-    node.get_logger().warning(f"parameter {name} has no effect any more: set {_RETIRED[name]} instead, and remove it")
 
 
 def _warn_of_unknown(node: Node, name: str) -> None:

@@ -70,7 +70,7 @@ def read_calibration(path: Path) -> FileCameraInfo:
             _numbers(content, "projection_matrix", 12),
         )
     except OSError as error:
-        raise ValueError(f"{path}: cannot be read: {error.strerror}") from error
+        raise ValueError(f"{path}: cannot be read: {error.strerror or error}") from error
     except KeyError as error:
         raise ValueError(
             f"{path}: lacks the key {error}: a calibration as camera_calibration writes it is expected"

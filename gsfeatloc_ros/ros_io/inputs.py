@@ -223,11 +223,12 @@ class Inputs:
 
     def has_odometry(self, stamp: int) -> bool:
         """Return whether odometry says where the robot was at `stamp` (nanoseconds)."""
-        return self._odometry.motion(stamp, stamp) is not None
+        return self._odometry.between(stamp, stamp) is not None
 
     def travelled(self, start: int, end: int) -> Travelled | None:
         """Return how far the robot went between two times (nanoseconds); None where odometry does not tell."""
-        return self._odometry.travelled(start, end)
+        way = self._odometry.between(start, end)
+        return None if way is None else way.travelled
 
     def carried_sigma(self) -> float | None:
         """Return the standard deviation of the last answer's position as odometry has carried it up to now.
@@ -237,7 +238,7 @@ class Inputs:
         prior, newest = self._prior.value, self._odometry.newest
         if prior is None or not prior.source.own or not prior.stamp or newest is None:
             return None
-        travelled = self._odometry.travelled(prior.stamp, newest)
+        travelled = self.travelled(prior.stamp, newest)
         return (
             None
             if travelled is None
@@ -332,13 +333,11 @@ class Inputs:
         if not stamp or not prior.stamp:
             return pose, covariance
         age = 1e-9 * (stamp - prior.stamp)
-        carried = abs(age) <= policy.odometry_max_age
-        motion = self._odometry.motion(prior.stamp, stamp) if carried else None
-        travelled = self._odometry.travelled(prior.stamp, stamp) if carried else None
-        if motion is not None and travelled is not None:
+        way = self._odometry.between(prior.stamp, stamp) if abs(age) <= policy.odometry_max_age else None
+        if way is not None:
             T_body_camera = self._transform(self._odometry_body, camera_frame, stamp)
-            pose = pose @ invert(T_body_camera) @ motion @ T_body_camera
-            return pose, self._grown(covariance, policy.growth.by_odometry(travelled))
+            pose = pose @ invert(T_body_camera) @ way.motion @ T_body_camera
+            return pose, self._grown(covariance, policy.growth.by_odometry(way.travelled))
         if not prior.source.own and policy.max_age and -age > policy.max_age:
             raise ValueError(
                 f"{prior.source.value} is {-age:.1f} s newer than the image (at most {policy.max_age:g}, "

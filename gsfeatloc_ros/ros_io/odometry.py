@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_left
+from dataclasses import dataclass
 from threading import Lock
 
 import numpy as np
@@ -16,6 +17,19 @@ _MAX_DISTANCE = 200_000_000
 _MAX_DISORDER = 1_000_000_000
 # Poses. A minute of odometry at 200 Hz; stamps may say that much less time has passed than has.
 _MAX_KEPT = 20_000
+
+
+@dataclass(frozen=True, eq=False)
+class Way:
+    """How a body went from one place to another.
+
+    Attributes:
+        motion: (4, 4) pose of the body at the end in its frame at the start.
+        travelled: how long the way was, to the next messages.
+    """
+
+    motion: np.ndarray
+    travelled: Travelled
 
 
 class OdometryBuffer:
@@ -60,14 +74,19 @@ class OdometryBuffer:
             end = bisect_left(self._stamps, stamp)
             del self._stamps[end:], self._poses[end:], self._way[end:]
 
-    def motion(self, start: int, end: int) -> np.ndarray | None:
-        """Return the pose (4, 4) of the body at `end` in the body's frame at `start` (nanoseconds).
+    def between(self, start: int, end: int) -> Way | None:
+        """Return how the body went from where it was at `start` to where it was at `end` (nanoseconds).
 
         None where it is not known, because nothing came near one of the two times.
         """
         with self._lock:
             at_start, at_end = self._at(start), self._at(end)
-        return None if at_start is None or at_end is None else invert(at_start) @ at_end
+            if at_start is None or at_end is None:
+                return None
+            last = len(self._stamps) - 1
+            first, second = (self._way[min(bisect_left(self._stamps, stamp), last)] for stamp in (start, end))
+        distance, turn = np.abs(second - first).tolist()
+        return Way(invert(at_start) @ at_end, Travelled(distance, turn))
 
     def velocity(self, stamp: int) -> np.ndarray | None:
         """Return how the body moves at `stamp` (nanoseconds): (6,) metres and radians a second, in its own axes.
@@ -81,16 +100,6 @@ class OdometryBuffer:
             motion = invert(self._poses[after - 1]) @ self._poses[after]
             seconds = 1e-9 * (self._stamps[after] - self._stamps[after - 1])
         return np.concatenate([motion[:3, 3], so3_log(motion[:3, :3])]) / seconds
-
-    def travelled(self, start: int, end: int) -> Travelled | None:
-        """Return how long the way was between two times (nanoseconds), to the next messages; None as of `motion`."""
-        with self._lock:
-            if self._at(start) is None or self._at(end) is None:
-                return None
-            last = len(self._stamps) - 1
-            first, second = (self._way[min(bisect_left(self._stamps, stamp), last)] for stamp in (start, end))
-        distance, turn = np.abs(second - first).tolist()
-        return Travelled(distance, turn)
 
     def _at(self, stamp: int) -> np.ndarray | None:
         after = bisect_left(self._stamps, stamp)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Mapping
+import logging
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -15,12 +16,15 @@ from gsfeatloc_ros.localize.settings import CpuSettings, MapSettings, MatcherSet
 from gsfeatloc_ros.ros_io.decode import frame_name
 from gsfeatloc_ros.ros_io.extrinsics import AnswerFrames
 from gsfeatloc_ros.ros_io.growth import GrowthOptions
+from gsfeatloc_ros.ros_io.old_parameters import RENAMED, notice
 from gsfeatloc_ros.ros_io.prior import PriorPolicy
 from gsfeatloc_ros.ros_io.state import StateOptions
 
 CONTINUOUS, ON_PRIOR, ON_REQUEST = "continuous", "on_prior", "on_request"
 CAMERA, BASE = "camera", "base"
 RAW, COMPRESSED = "raw", "compressed"
+
+_log = logging.getLogger(__name__)
 
 _POLICY = PriorPolicy()
 
@@ -204,18 +208,26 @@ class Settings:
         )
 
     @staticmethod
-    def checked(values: Mapping[str, Any]) -> Settings:
+    def checked(values: Mapping[str, Any], say: Callable[[str], None] = _log.warning) -> Settings:
         """Return the settings of values that people wrote; of parameters that are ROS's own there is no notice.
+
+        Args:
+            values: by name; those of the last release are accepted, as by the node.
+            say: is told of these.
 
         Raises:
             ValueError: there is no such parameter, or it does not take such a value; the message says which.
         """
         known = {item.name: item for item in PARAMETERS}
         converted = {}
-        for name, value in values.items():
+        # Old names first: a new one counts more.
+        for given in sorted(values, key=lambda name: name not in RENAMED):
+            name = RENAMED.get(given, given)
+            if old := notice(given):
+                say(old)
             if name in known:
-                converted[name] = known[name].converted(value)
-            elif not name.startswith(_OF_ROS):
+                converted[name] = known[name].converted(values[given])
+            elif not old and not name.startswith(_OF_ROS):
                 near = nearest_name(name)
                 raise ValueError(f"there is no parameter {name}{f': is {near} meant?' if near else ''}")
         return Settings.of(converted)

@@ -23,6 +23,7 @@ from typing import Any
 from tqdm import tqdm
 
 from gsfeatloc_ros.common.parameter import values_of
+from gsfeatloc_ros.common.threads import limit_threads
 from gsfeatloc_ros.common.words import in_one_line
 from gsfeatloc_ros.evaluate.extras import import_extra
 from gsfeatloc_ros.localize.engine import Engine, load_engine
@@ -74,6 +75,7 @@ def _replay(options: argparse.Namespace) -> int:
     if options.truth:
         import_extra("matplotlib")  # to say now, not after an hour, that it is missing
     settings = _settings(options)
+    limit_threads(settings.cpu.threads)
     calibration = read_calibration(options.calibration) if options.calibration else None
     with open_bag(options.bag, _topics(options, settings)) as bag:
         replay = Replay(bag, _engine(settings), settings, calibration)
@@ -135,11 +137,16 @@ def _settings(options: argparse.Namespace) -> Settings:
         "localizer.max_image_width": options.max_width,
     }
     values |= {name: value for name, value in own.items() if value is not None}
-    settings = Settings.checked(values | {f"localizer.{name}": value for name, value in options.set.items()})
+    values |= {f"localizer.{name}": value for name, value in options.set.items()}
+    settings = Settings.checked(values, _say)
     for name in _WITHOUT_EFFECT:
         if name in values:
-            print(f"replay: parameter {name} has no effect here", file=sys.stderr)
+            _say(f"parameter {name} has no effect here")
     return settings
+
+
+def _say(notice: str) -> None:
+    print(f"replay: {notice}", file=sys.stderr)
 
 
 def _topics(options: argparse.Namespace, settings: Settings) -> dict[Role, list[str]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import pytest
 from gsfeatloc_ros.common.parameter import values_of
 from gsfeatloc_ros.localize.settings import MapSettings
 from gsfeatloc_ros.maps import ReadOptions
+from gsfeatloc_ros.ros_io.old_parameters import RETIRED
 from gsfeatloc_ros.ros_io.parameter_file import parse_parameter, read_parameter_file
 from gsfeatloc_ros.ros_io.settings import Settings
 
@@ -72,8 +74,28 @@ def test_values_that_cannot_be_used(values, says):
         Settings.checked(values)
 
 
+@pytest.mark.parametrize("values", [{"renderer.threads": 1}, {"cpu.threads": 1, "renderer.threads": 2}])
+def test_an_old_name_works_as_for_the_node(values):
+    said: list[str] = []
+    assert Settings.checked(values, said.append).cpu.threads == 1
+    assert said == ["parameter renderer.threads is called cpu.threads now: rename it"]
+
+
+@pytest.mark.parametrize("name", RETIRED)
+def test_what_has_no_effect_any_more_is_accepted_as_by_the_node(name):
+    said: list[str] = []
+    assert Settings.checked({name: "high"}, said.append) == Settings()
+    assert said == [f"parameter {name} has no effect any more: set localizer.max_risk instead, and remove it"]
+
+
 @pytest.mark.parametrize(("text", "says"), [("[", "is no YAML"), ("", "has no parameters of the node localizer")])
 def test_files_that_cannot_be_used(tmp_path, text, says):
     (tmp_path / "params.yaml").write_text(text)
     with pytest.raises(ValueError, match=f"params.yaml: {says}"):
+        read_parameter_file(tmp_path / "params.yaml")
+
+
+def test_a_pipe_in_place_of_a_file_is_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "params.yaml")
+    with pytest.raises(ValueError, match=r"params\.yaml: cannot be read: is not a regular file"):
         read_parameter_file(tmp_path / "params.yaml")
