@@ -285,7 +285,7 @@ class _Candidate:
     def pose(self) -> tuple[np.ndarray, np.ndarray] | None:
         """The pose (4, 4) with its covariance (6, 6), by the camera as the photo shows it; None for none."""
         answer = self.camera_fit or self.view.solution
-        return answer and (answer.T_map_camera, answer.covariance)
+        return (answer.T_map_camera, answer.covariance) if answer else None
 
     def trace(self, photo: Photo, search: Search, rivals: Sequence[_Candidate] = ()) -> Trace:
         """Return the estimate that this is, after a search, unless `rivals` explain the photo equally well."""

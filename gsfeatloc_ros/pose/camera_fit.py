@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsfeatloc_ros.common.camera import Camera
-from gsfeatloc_ros.common.geometry import invert, make_pose, skew, so3_exp, transform
+from gsfeatloc_ros.common.geometry import make_pose, skew, so3_exp
 from gsfeatloc_ros.pose.solve import Correspondences, PoseOptions, shared_variance, whiten
 
 # Parameters beside the pose: focal length (relative), k1, and by how much the camera turns, in radians about its axes,
@@ -54,10 +54,9 @@ class CameraFit:
     def reprojection_errors(self, camera: Camera, found: Correspondences) -> np.ndarray:
         """Return the distances (M,) in pixels between pixels and points seen by this camera; inf behind it."""
         errors = np.full(len(found.pixels), np.inf)
-        ahead = transform(invert(self.T_map_camera), found.points)[:, 2] > 0
-        linear = _linearize(camera, self.T_map_camera, self.followed, found.select(ahead))
-        if linear is not None:
-            errors[ahead] = np.linalg.norm(linear[0], axis=1)
+        ahead = _in_camera(camera, self.T_map_camera, self.followed, found)[:, 2] > np.finfo(np.float32).tiny
+        residuals, _ = _linearize(camera, self.T_map_camera, self.followed, found.select(ahead))
+        errors[ahead] = np.linalg.norm(residuals, axis=1)
         return errors
 
 
@@ -80,28 +79,39 @@ def fit_camera(
     Returns:
         The fit; None where the matches do not determine it.
     """
-    start = _State(T_map_camera, np.zeros(len(_ANY_CAMERA)))
-    problem = _Problem.at(camera, found, options, start)
     try:
-        free = problem and problem.solve(start, _ANY_CAMERA)
-        # The keypoints' noise is what is left once the camera's errors are explained.
-        problem = free and _Problem.at(camera, found, options, free)
-        if free is None or problem is None:
-            return None
-        sigmas = np.sqrt(np.diag(problem.covariance(free, _ANY_CAMERA)))[6:]
-        excess = np.sqrt(np.maximum(free.camera**2 - sigmas**2, 0.0))
-        kept = problem.solve(free, np.clip(np.where(_CONTRADICTED, excess, 0.0), _EXACT, _ANY_CAMERA))
-        if kept is None:
-            return None
-        # What a calibration in use would move the pose by is not known better than that.
-        shift = problem.step(kept, _CALIBRATED)[:6]
-        covariance = problem.covariance(kept, _CALIBRATED)[:6, :6] + np.outer(shift, shift)
-    except np.linalg.LinAlgError:
+        fit = _fit(camera, _State(T_map_camera, np.zeros(len(_ANY_CAMERA))), found, options)
+    except (np.linalg.LinAlgError, _BehindCameraError):
         return None
-    if not (np.isfinite(sigmas).all() and np.isfinite(covariance).all() and np.linalg.eigvalsh(covariance)[0] > 0):
-        return None
-    (focal, k1), (focal_sigma, k1_sigma) = free.camera[:2].tolist(), sigmas[:2].tolist()
-    return CameraFit(focal, focal_sigma, k1, k1_sigma, free.camera[2:], sigmas[2:], kept.pose, covariance, kept.camera)
+    covariance = fit.covariance
+    finite = np.isfinite([fit.focal_sigma, fit.k1_sigma, *fit.rolling_sigma]).all() and np.isfinite(covariance).all()
+    return fit if finite and np.linalg.eigvalsh(covariance)[0] > 0 else None
+
+
+def _fit(camera: Camera, calibrated: _State, found: Correspondences, options: PoseOptions) -> CameraFit:
+    free = _Problem.at(calibrated, camera, found, options).solve(calibrated, _ANY_CAMERA)
+    # The keypoints' noise is what is left once the camera's errors are explained.
+    problem = _Problem.at(free, camera, found, options)
+    sigmas = np.sqrt(np.maximum(np.diag(problem.covariance(free, _ANY_CAMERA))[6:], 0.0))
+    excess = np.sqrt(np.maximum(free.camera**2 - sigmas**2, 0.0))
+    kept = problem.solve(free, np.clip(np.where(_CONTRADICTED, excess, 0.0), _EXACT, _ANY_CAMERA))
+    # What a calibration in use would move the pose by is not known better than that.
+    shift = problem.step(kept, _CALIBRATED)[:6]
+    return CameraFit(
+        focal=float(free.camera[0]),
+        focal_sigma=float(sigmas[0]),
+        k1=float(free.camera[1]),
+        k1_sigma=float(sigmas[1]),
+        rolling=free.camera[2:],
+        rolling_sigma=sigmas[2:],
+        T_map_camera=kept.pose,
+        covariance=problem.covariance(kept, _CALIBRATED)[:6, :6] + np.outer(shift, shift),
+        followed=kept.camera,
+    )
+
+
+class _BehindCameraError(ValueError):
+    """A point is not ahead of the camera."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,38 +152,33 @@ class _Problem:
     options: PoseOptions
 
     @classmethod
-    def at(cls, camera: Camera, found: Correspondences, options: PoseOptions, state: _State) -> _Problem | None:
-        """Return the problem with the keypoints' noise as measured at a state; None where points are behind it."""
-        linear = _linearize(camera, state.pose, state.camera, found)
-        whitening = None if linear is None else whiten(camera, state.pose, found, linear[0])
-        return None if whitening is None else cls(camera, found, whitening, options)
+    def at(cls, state: _State, camera: Camera, found: Correspondences, options: PoseOptions) -> _Problem:
+        """Return the problem with the keypoints' noise as measured at a state."""
+        residuals, _ = _linearize(camera, state.pose, state.camera, found)
+        whitening = whiten(camera, state.pose, found, residuals)
+        if whitening is None:
+            raise _BehindCameraError
+        return cls(camera, found, whitening, options)
 
-    def solve(self, start: _State, deviations: np.ndarray) -> _State | None:
-        """Return the most likely state; None where points get behind the camera."""
+    def solve(self, start: _State, deviations: np.ndarray) -> _State:
+        """Return the most likely state."""
         state = start
         for _ in range(_MAX_ITERATIONS):
             step = self.step(state, deviations)
-            if not np.isfinite(step).all():
-                return None
             state = state.moved(step)
             if np.abs(step[6:] / _ANY_CAMERA).max() < _MIN_STEP:
                 break
-        return state if np.isfinite(state.pose).all() else None
+        return state
 
     def step(self, state: _State, deviations: np.ndarray) -> np.ndarray:
-        """Return the step (11,) to the most likely state of the linearized problem; NaN with points behind."""
-        system = self._system(state)
-        if system is None:
-            return np.full(11, np.nan)
-        information = _information(deviations)
+        """Return the step (11,) to the most likely state of the linearized problem."""
+        system, information = self._system(state), _information(deviations)
         known = information * np.concatenate([np.zeros(6), state.camera])
         return -np.linalg.solve(system.hessian + np.diag(information), system.gradient + known)
 
     def covariance(self, state: _State, deviations: np.ndarray) -> np.ndarray:
         """Return the covariance (11, 11) of pose and camera, with what the matches have in common, as of a pose."""
         system, known = self._system(state), np.diag(_information(deviations))
-        if system is None:
-            return np.full((11, 11), np.nan)
         weights = system.weights
         inflation = max((weights * system.squared).sum() / max(2 * weights.sum() - len(known), 1.0), 1.0)
         weighted = (weights[:, None, None] * system.jacobian).reshape(-1, len(known))
@@ -182,12 +187,9 @@ class _Problem:
         # What they have in common counts as one match with that error, beside what is known before.
         return inflation * np.linalg.inv(system.hessian + known) + np.linalg.inv(of_a_match / shared + known)
 
-    def _system(self, state: _State) -> _System | None:
+    def _system(self, state: _State) -> _System:
         """Return the whitened problem with Cauchy's weights (iteratively reweighted least squares)."""
-        linear = _linearize(self.calibrated, state.pose, state.camera, self.found)
-        if linear is None:
-            return None
-        residuals, jacobian = linear
+        residuals, jacobian = _linearize(self.calibrated, state.pose, state.camera, self.found)
         white = np.einsum("mij,mj->mi", self.whitening, residuals)
         white_jacobian = self.whitening @ jacobian
         squared = (white**2).sum(axis=1)
@@ -203,18 +205,26 @@ def _information(deviations: np.ndarray) -> np.ndarray:
     return np.concatenate([np.zeros(6), 1.0 / deviations**2])
 
 
+def _when(camera: Camera, found: Correspondences) -> np.ndarray:
+    """Return when (M, 1) the pixels' rows are read, from -0.5 for the first row to 0.5 for the last."""
+    return ((found.pixels[:, 1] + 0.5) / camera.height - 0.5)[:, None]
+
+
+def _in_camera(camera: Camera, pose: np.ndarray, extra: np.ndarray, found: Correspondences) -> np.ndarray:
+    """Return the points (M, 3) in the camera frame as their rows are read: it has turned by then, by small angles."""
+    in_camera = (found.points - pose[:3, 3]) @ pose[:3, :3]
+    return in_camera - np.cross(_when(camera, found) * extra[2:], in_camera)
+
+
 def _linearize(
     camera: Camera, pose: np.ndarray, extra: np.ndarray, found: Correspondences
-) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return residuals (M, 2) and their Jacobians (M, 2, 11) by pose and camera; None with points behind the camera."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return residuals (M, 2) and their Jacobians (M, 2, 11) by pose and camera; raise _BehindCameraError."""
     offsets = found.points - pose[:3, 3]
-    when = ((found.pixels[:, 1] + 0.5) / camera.height - 0.5)[:, None]
-    in_camera = offsets @ pose[:3, :3]
-    # The camera has turned by when * rolling as the row is read: to first order, as the angles are small.
-    in_camera = in_camera - np.cross(when * extra[2:], in_camera)
+    in_camera = _in_camera(camera, pose, extra, found)
     z = in_camera[:, 2:]
     if not (z > 0).all():
-        return None
+        raise _BehindCameraError
     slopes = in_camera[:, :2] / z
     radius2 = (slopes**2).sum(axis=1, keepdims=True)
     focal = np.array([camera.K[0, 0], camera.K[1, 1]])
@@ -231,7 +241,7 @@ def _linearize(
             by_point @ skew(offsets),
             (focal * slopes * bent)[..., None],
             ((1 + extra[0]) * focal * slopes * radius2)[..., None],
-            by_point_in_camera @ skew(in_camera) * when[..., None],
+            by_point_in_camera @ skew(in_camera) * _when(camera, found)[..., None],
         ],
         axis=2,
     )
