@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 
 from gsfeatloc_ros.client.bag_player import Reply, Topics, play_bag, play_lost
-from gsfeatloc_ros.client.process import INDEX_READY, START_TIMEOUT, isolate_ros, running_localizer
+from gsfeatloc_ros.client.process import INDEX_READY, isolate_ros, running_localizer
 from gsfeatloc_ros.client.score import MAX_ROTATION_ERROR_DEG, MAX_TRANSLATION_ERROR, Score, draw_scores, score
 from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.maps.ply import write_ply
@@ -41,6 +41,8 @@ _CAMERA = Camera(640, 480, np.array(_K), np.array([-0.28, 0.09, 0.0008, -0.0005,
 _VIEWS = 120
 _PICTURE_ROWS = 4
 _KIDNAPPINGS = 5
+# Seconds until the map's views are known: half a minute, or many on cores that others use.
+_INDEX_TIMEOUT = 900.0
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -70,7 +72,7 @@ def _demo(args: argparse.Namespace) -> int:
     try:
         with running_localizer(parameters, TOPICS.remappings, log) as localizer:
             print(f"localizer: started with {args.matcher}, its log in {log}", flush=True)
-            localizer.wait_for_output(INDEX_READY, START_TIMEOUT)
+            localizer.wait_for_output(INDEX_READY, _INDEX_TIMEOUT)
             print("localizer: knows what the room looks like from anywhere\n", flush=True)
             scores = _play(photos, play_bag(bag, TOPICS, lambda: localizer.alive))
             print("\nkidnapped: it is told that it is lost, and sees another place without a prior", flush=True)
