@@ -13,7 +13,7 @@ help:
 	@echo "make real   test with real maps and scenes, where they are (test/real/README.md)"
 	@echo "make gpu    test the code for GPUs; without a GPU, on a simulated one"
 	@echo "make gsplat test the GPU renderer with gsplat's own kernels, compiled for the CPU"
-	@echo "make fuzz   feed damaged files and messages to what reads them, for ten minutes"
+	@echo "make fuzz   feed damaged files and messages to what reads them, and to the node: twelve minutes"
 	@echo "make lint   check the style and the types of the code"
 	@echo "make build  build with colcon, into install/"
 	@echo "make lock   make locks/ fit setup.py; with ARGS=--upgrade, to the newest versions"
@@ -56,6 +56,7 @@ gsplat: build
 
 fuzz: build
 	@. scripts/env.sh && python -P scripts/fuzz.py $(ARGS)
+	@. scripts/env.sh && python -P scripts/fuzz_node.py
 
 lint: setup
 	@. scripts/env.sh && ruff check . && ruff format --check . && mypy

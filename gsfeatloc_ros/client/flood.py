@@ -17,6 +17,7 @@ from std_srvs.srv import Trigger
 from gsfeatloc_ros.client.client_node import ClientNode
 from gsfeatloc_ros.client.messages import camera_info_of, pose_with_covariance, rgb_image
 from gsfeatloc_ros.client.robot import PHOTOS, Drift, camera_of, true_poses
+from gsfeatloc_ros.node.qos import REQUESTS
 from gsfeatloc_ros.ros_io.outcome import OutcomeStatus
 
 try:
@@ -127,7 +128,8 @@ class _Sender:
         self._client, self._flood = client, flood
         self._replies: list[FloodReply] = []
         service = Trigger if flood.service == RELOCALIZE else LocalizeImage
-        self._service = client.node.create_client(service, f"localizer/{flood.service}")
+        # Many answers may come at once, of which none may be lost on this side.
+        self._service = client.node.create_client(service, f"localizer/{flood.service}", qos_profile=REQUESTS)
         if flood.service == LOCALIZE_IMAGE:
             self._images, self._info = list(map(rgb_image, np.load(photos_file))), camera_info_of(camera_of(size))
             self._poses, self._drift = true_poses(), Drift(2)

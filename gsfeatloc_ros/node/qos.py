@@ -30,7 +30,8 @@ LAST = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 # All of it counts, and much may come while a map is loaded.
 ODOMETRY = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
 # Requests may come all at once: none is lost while another is taken. But those that hold images would fill the memory
-# where the processor cannot keep up with taking them: no more than these are kept.
+# where the processor cannot keep up with taking them: no more than these are kept. DDS bounds their number (by default
+# 5000), never their bytes, and tells nobody that it dropped one.
 REQUESTS = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)
 IMAGE_REQUESTS = QoSProfile(depth=12)
 # Messages of a topic between the two times that one comes.

@@ -5,6 +5,9 @@ are off as a robot's odometry is. Meanwhile the services are called every few se
 
     gsfeatloc soak --seconds 600 --size 1920x1080 --rate 10 --folder /tmp/soak --json soak.json
 
+With --faults a process of its own makes one every two seconds: parameters of no type, malformed messages and requests,
+maps that are bombs or pipes, and the map itself with planted caches; all that is asked has to be answered.
+
 With --flood many more requests come on top, from a process of its own, at one time of the stream; it may be given more
 than once. 400 requests at 15 a second, and 500 at once:
 
@@ -20,6 +23,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from gsfeatloc_ros.client.faults import run_faults
 from gsfeatloc_ros.client.flood import LOCALIZE_IMAGE, RELOCALIZE, Flood, FloodProcess
 from gsfeatloc_ros.client.observer import Observer
 from gsfeatloc_ros.client.process import isolate_ros, running_localizer
@@ -38,23 +42,27 @@ def _soak(args: argparse.Namespace) -> int:
     print(f"soak: the map and the photos are kept in {args.folder}", file=sys.stderr)
     map_file, photos_file = prepare_room(args.folder, args.size)
     isolate_ros()
-    robot = multiprocessing.get_context("spawn").Process(
-        target=run_robot, args=(photos_file, args.size, args.rate, args.seconds)
-    )
+    context = multiprocessing.get_context("spawn")
+    robot = context.Process(target=run_robot, args=(photos_file, args.size, args.rate, args.seconds))
+    made, unanswered = context.Value("q", 0), context.Value("q", 0)
+    faults = context.Process(target=run_faults, args=(map_file.resolve(), args.size, made, unanswered))
     observer = Observer(photos_file, args.size)
     floods = [FloodProcess(flood, photos_file, args.size) for flood in args.flood]
     try:
         with running_localizer({"map.path": map_file.resolve()}) as localizer:
             localizer.wait_until_ready()
             robot.start()
+            if args.faults:
+                faults.start()
             observer.watch(localizer.pid, robot, floods)
     except (RuntimeError, TimeoutError) as error:
         print(f"soak: {error}", file=sys.stderr)
         return 1
     finally:
         observer.close()
-        if robot.is_alive():
-            robot.terminate()
+        for process in (robot, faults):
+            if process.is_alive():
+                process.terminate()
         for flood in floods:
             flood.stop()
     record = observer.record
@@ -63,6 +71,9 @@ def _soak(args: argparse.Namespace) -> int:
         return 1
     size = f"{args.size[0]}x{args.size[1]}"
     result = {"size": size, "rate": args.rate} | summarize(record, args.seconds)
+    if args.faults:
+        result |= {"faults": made.value, "faults_unanswered": unanswered.value}
+        result["targets"]["faults are answered"] = unanswered.value == 0
     if floods:
         add_floods(result, record, [(flood.flood, flood.replies) for flood in floods])
     print(json.dumps(result, indent=2))
@@ -91,6 +102,7 @@ def make_parser() -> argparse.ArgumentParser:
         default=[],
         help="SERVICE,REQUESTS,RATE,SECOND: requests on top, so many a second (0: at once), from that second on",
     )
+    parser.add_argument("--faults", action="store_true", help="make a fault every two seconds")
     parser.add_argument("--json", type=Path, help="file of the results")
     return parser
 

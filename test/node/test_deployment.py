@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shlex
+import shutil
 import subprocess
 import xml.etree.ElementTree as ElementTree
 from configparser import ConfigParser
@@ -175,8 +176,25 @@ def test_the_unit_starts_the_installed_executable(unit: ConfigParser):
     assert "exec /opt/gsfeatloc/install/gsfeatloc_ros/lib/gsfeatloc_ros/localizer --ros-args" in script
     for name in re.findall(r"-r (\w+):=", script):
         assert name in SUBSCRIBED
-    # The renderer compiles machine code when it starts.
-    assert "MemoryDenyWriteExecute" not in service
+    # The renderer compiles machine code when it starts; the memory that is left is read from /proc/meminfo; the camera
+    # driver's shared memory is of the same user.
+    assert not {"MemoryDenyWriteExecute", "ProcSubset", "RemoveIPC"} & set(service)
+
+
+def test_the_unit_is_bounded(unit: ConfigParser):
+    service = unit["Service"]
+    for name in ("MemoryMax", "TasksMax", "LimitCORE", "UMask", "ProtectProc", "SystemCallFilter", "WatchdogSec"):
+        assert service.get(name), name
+    assert service["CapabilityBoundingSet"] == ""
+
+
+@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd-analyze is not installed")
+def test_systemd_understands_the_unit():
+    path = ROOT / "deploy/gsfeatloc-localizer.service"
+    verified = subprocess.run(["systemd-analyze", "verify", path], capture_output=True, text=True)
+    assert (verified.returncode, verified.stderr) == (0, "")
+    command = ["systemd-analyze", "security", "--offline=true", "--threshold=15", path]
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
 
 
 def test_the_profile_named_is_installed():
