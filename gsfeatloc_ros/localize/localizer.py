@@ -317,7 +317,7 @@ def _nothing_in_common(photo: Photo, features: int, search: Search, reading: Rea
         return Trace(Estimate(Status.FAILED, reason, evidence=search.counted(Evidence())), photo)
     other = f". {reading.other}" if reading.other else ""
     if search.best is None:
-        reason = f"none of {looked} suggests a pose: {features} features in the photo{other}"
+        reason = f"nothing {looked} suggests a pose: {features} features in the photo{other}"
         return Trace(Estimate(Status.FAILED, reason, evidence=search.counted(Evidence())), photo)
     best = search.best
     evidence = Evidence(matches=best.matches, lifted=len(best.found.pixels), inliers=best.inliers)
