@@ -10,7 +10,7 @@ from typing import Any
 import yaml
 
 from gsfeatloc_ros.common.geometry import quaternion_from_matrix
-from gsfeatloc_ros.common.parameter import values_of
+from gsfeatloc_ros.common.parameter import parameters_of, values_of
 from gsfeatloc_ros.common.replaced_file import replaced_file
 from gsfeatloc_ros.localize.settings import MapSettings
 from gsfeatloc_ros.maps.similarity import Similarity
@@ -41,16 +41,18 @@ class Alignment:
         """
         # What nerfstudio's file says stays a parameter of its own, and comes before.
         moved = self.S_robot_map @ replace(map_, dataparser_transforms="").alignment()
-        for parameter, value in (("map.scale", moved.scale),):
-            if not 1e-6 <= value <= 1e6:
-                raise ValueError(f"{parameter} would be {value:g}, which is not within 1e-06 and 1e+06")
-        return replace(
+        placed = replace(
             map_,
             aligned=self.complete,
             scale=moved.scale,
             translation=tuple(moved.translation.tolist()),
             rotation=tuple(quaternion_from_matrix(moved.rotation).tolist()),
         )
+        # As the node will.
+        for parameter in parameters_of(MapSettings, "map."):
+            if parameter.name in _PLACE:
+                parameter.converted(values_of(placed, "map.")[parameter.name])
+        return placed
 
 
 def write_parameters(path: Path, map_: MapSettings, comments: Sequence[str]) -> None:

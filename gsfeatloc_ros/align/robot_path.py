@@ -52,7 +52,7 @@ class RobotPath:
             there = f"no odometry on {self.odometry}" if self.odometry else f"tf to {self.frame} at no photo's time"
             raise BagError(f"{self.bag}: has {there}")
         if body:
-            T_body_camera = self._mounted(body)
+            T_body_camera = self.mounted(body)
             return [(stamp, pose @ T_body_camera) for stamp, pose in poses]
         return poses
 
@@ -69,7 +69,7 @@ class RobotPath:
             raise BagError(f"{self.bag}: {self.odometry} is of {' and of '.join(sorted(bodies))}")
         return poses, "".join(bodies)
 
-    def _mounted(self, body: str) -> np.ndarray:
+    def mounted(self, body: str) -> np.ndarray:
         """Return T_body_camera (4, 4), of a camera that does not move on the robot."""
         if self.T_body_camera is not None:
             return self.T_body_camera

@@ -159,6 +159,7 @@ class Imu(Protocol):
 
     header: Header
     linear_acceleration: Vector3
+    linear_acceleration_covariance: Sequence[float] | np.ndarray
 
 
 AnyImage = Image | CompressedImage

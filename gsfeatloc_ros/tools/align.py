@@ -3,10 +3,14 @@
     gsfeatloc align trajectory --answers answers.csv --trajectory odometry.tum --out map.yaml
     gsfeatloc align drive BAG --map map.ply --image /camera/image_raw \\
         --camera-info /camera/camera_info --odom /odom --out map.yaml
+    gsfeatloc align gravity --map map.ply --answers answers.csv --bag BAG --imu /imu --out map.yaml
+    gsfeatloc align distance --points 0 0 0 1 0.5 0 --distance 1.72 --out map.yaml
+    gsfeatloc align target --scene SCENE --tag 36h11 --size 0.16 --out map.yaml
 
 trajectory takes answers that are there already (replay's answers.csv, or a TUM file), drive localizes the photos of a
-bag first. docs/frames.md says which way suits whom. Where the map lies by --map-scale and so on counts: the answers are
-given there.
+bag first; both find the whole similarity. gravity finds roll, pitch and the floor, distance and target the scale.
+docs/frames.md says which way suits whom. Where the map lies already, by --params-file (of a step before) or --map-scale
+and so on, counts: answers, points and poses are given there.
 
 The exit status is 1, and nothing is written, where the data do not determine what is asked, 2 where something cannot be
 used.
@@ -16,33 +20,26 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from tqdm import tqdm
 
 from gsfeatloc_ros.align.alignment import Alignment, write_parameters
-from gsfeatloc_ros.align.determination import Precision, check, report
-from gsfeatloc_ros.align.fit import UndeterminedError, fit_drive
-from gsfeatloc_ros.align.localized import localize_bag
-from gsfeatloc_ros.align.pairs import Answer, match
-from gsfeatloc_ros.align.pose_files import read_answers, read_tum
-from gsfeatloc_ros.align.robot_path import RobotPath
-from gsfeatloc_ros.common.geometry import make_pose, matrix_from_quaternion
+from gsfeatloc_ros.align.determination import Precision
+from gsfeatloc_ros.align.fit import UndeterminedError
+from gsfeatloc_ros.align.target import FAMILIES
+from gsfeatloc_ros.align.ways import by_distance, by_drive, by_gravity, by_target, by_trajectory, map_now
 from gsfeatloc_ros.common.kernel_cache import can_write
-from gsfeatloc_ros.localize.settings import MapSettings, MatcherSettings
+from gsfeatloc_ros.localize.settings import MatcherSettings
 from gsfeatloc_ros.match import MATCHERS
-from gsfeatloc_ros.replay.bag import Role
-from gsfeatloc_ros.replay.truth import MAX_GAP, Trajectory
-from gsfeatloc_ros.ros_io.calibration_file import read_calibration
-from gsfeatloc_ros.ros_io.settings import Settings
+from gsfeatloc_ros.replay.truth import MAX_GAP
 from gsfeatloc_ros.tools.options import add_map_options, map_settings, number
 from gsfeatloc_ros.tools.status import run_tool
 
 # The exit status where the data do not determine what is asked.
 UNDETERMINED = 1
+_FINITE = number(float, -np.inf)
 _POSE = ("X", "Y", "Z", "QX", "QY", "QZ", "QW")
 
 
@@ -57,6 +54,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _align(options: argparse.Namespace) -> int:
+    options.map_given = replace(map_settings(options), path=str(options.map or ""))
     # Now, not after minutes.
     if options.out.is_dir() or not can_write(options.out.absolute().parent):
         raise ValueError(f"{options.out}: cannot be written: name another file (--out)")
@@ -65,63 +63,12 @@ def _align(options: argparse.Namespace) -> int:
     except UndeterminedError as error:
         print(f"align: {error}; nothing is written", file=sys.stderr)
         return UNDETERMINED
-    map_ = alignment.applied_to(_map(options))
+    map_ = alignment.applied_to(map_now(options))
     about = f"where the map lies in the robot's frame, by gsfeatloc align {options.way}"
     write_parameters(options.out, map_, [about, *alignment.report])
     print("\n".join(alignment.report))
     print(f"wrote {options.out}")
     return 0
-
-
-def _trajectory(options: argparse.Namespace) -> Alignment:
-    return _fitted(options, read_answers(options.answers))
-
-
-def _drive(options: argparse.Namespace) -> Alignment:
-    if not options.map:
-        raise ValueError("name the map that the photos are to be localized in: --map")
-    if not options.camera_info and not options.calibration:
-        raise ValueError("name the topic of camera_info, or a file with the calibration: --camera-info, --calibration")
-    topics = {Role.IMAGE: options.image, Role.CAMERA_INFO: options.camera_info, Role.PRIOR: options.prior}
-    settings = Settings(map=_map(options), matcher=MatcherSettings(options.matcher, options.weights))
-    settings = replace(settings, node=replace(settings.node, max_rate=options.max_rate))
-    settings = replace(settings, index=replace(settings.index, build=not options.prior))
-    settings = replace(settings, image=replace(settings.image, rectified=options.rectified))
-    calibration = read_calibration(options.calibration) if options.calibration else None
-    named = {role: [topic] for role, topic in topics.items() if topic}
-    with tqdm(localize_bag(options.bag, named, settings, calibration), unit="photo", disable=None) as progress:
-        tried = list(progress)
-    answers = [answer for answer in tried if answer is not None]
-    print(f"localized {len(answers)} of {len(tried)} photos in the map as it lies now")
-    return _fitted(options, answers)
-
-
-def _fitted(options: argparse.Namespace, answers: Sequence[Answer]) -> Alignment:
-    """Fit the answers to the trajectory that the options name."""
-    mounted = None if options.extrinsics is None else _pose("--extrinsics", options.extrinsics)
-    if options.trajectory:
-        poses = read_tum(options.trajectory)
-        poses = poses if mounted is None else [(stamp, pose @ mounted) for stamp, pose in poses]
-    elif options.bag:
-        path = RobotPath(options.bag, options.odom, options.frame, options.camera_frame, options.image, mounted)
-        poses = path.read([answer.stamp for answer in answers])
-    else:
-        raise ValueError("name the robot's trajectory: --trajectory FILE, or --bag BAG with --odom or --frame")
-    pairs = match(answers, Trajectory(poses, options.max_gap), oriented=not options.positions_only)
-    fit = fit_drive(pairs, options.seed)
-    check(fit, Precision(options.max_scale_sd / 100, options.max_angle_sd))
-    return Alignment(fit.S_robot_map, complete=True, report=list(report(fit)))
-
-
-def _map(options: argparse.Namespace) -> MapSettings:
-    return replace(map_settings(options), path=str(options.map or ""))
-
-
-def _pose(option: str, values: Sequence[float]) -> np.ndarray:
-    try:
-        return make_pose(matrix_from_quaternion(values[3:]), values[:3])
-    except ValueError as error:
-        raise ValueError(f"{option}: {error}") from error
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -131,19 +78,97 @@ def make_parser() -> argparse.ArgumentParser:
     )
     ways = parser.add_subparsers(dest="way", required=True, metavar="WAY")
     way = ways.add_parser("trajectory", help="answers that are there already against the robot's trajectory")
-    way.set_defaults(run=_trajectory)
-    way.add_argument("--answers", type=Path, required=True, metavar="FILE", help="replay's answers.csv, or TUM")
+    way.set_defaults(run=by_trajectory)
+    _add_answers(way)
     way.add_argument("--bag", type=Path, help="rosbag2 with odometry or tf, instead of --trajectory")
     way.add_argument("--image", metavar="TOPIC", default="", help="of the bag, whose images name the camera's frame")
     _add_trajectory(way)
     _add_common(way)
     way = ways.add_parser("drive", help="the photos of a bag, localized here, against the robot's trajectory")
-    way.set_defaults(run=_drive)
+    way.set_defaults(run=by_drive)
     way.add_argument("bag", type=Path, help="folder of a rosbag2, or an .mcap or .db3 file")
     _add_photos(way)
     _add_trajectory(way)
     _add_common(way)
+    _add_gravity(ways.add_parser("gravity", help="what is up, and where the floor is: roll, pitch, height"))
+    _add_distance(ways.add_parser("distance", help="one distance that is known: the scale"))
+    _add_target(ways.add_parser("target", help="an AprilTag or a checkerboard in the photos: the scale"))
     return parser
+
+
+def _add_gravity(way: argparse.ArgumentParser) -> None:
+    way.set_defaults(run=by_gravity)
+    _add_answers(way)
+    way.add_argument("--bag", type=Path, help="rosbag2 with the IMU")
+    way.add_argument("--imu", metavar="TOPIC", default="", help="sensor_msgs/Imu of the bag")
+    way.add_argument("--image", metavar="TOPIC", default="", help="of the bag, whose images name the camera's frame")
+    way.add_argument("--camera-frame", default="", metavar="NAME", help="instead of --image")
+    way.add_argument(
+        "--extrinsics", type=_FINITE, nargs=7, metavar=_POSE, help="pose of the camera in the IMU's frame (default: tf)"
+    )
+    way.add_argument("--level", action="store_true", help="the camera is mounted level: the rows of photos are")
+    way.add_argument(
+        "--up",
+        choices=("gravity", "floor"),
+        default="gravity",
+        help="what roll and pitch are taken from in the end (default: %(default)s)",
+    )
+    way.add_argument("--metres", action="store_true", help="the unit is the metre already: writes map.aligned")
+    _add_common(way)
+
+
+def _add_distance(way: argparse.ArgumentParser) -> None:
+    way.set_defaults(run=by_distance)
+    way.add_argument("--distance", type=number(float, 1e-6), required=True, metavar="METRES")
+    way.add_argument("--points", type=_FINITE, nargs=6, metavar=("X", "Y", "Z") * 2, help="two points of the map")
+    way.add_argument(
+        "--pixels", type=_FINITE, nargs=6, metavar=("STAMP", "U", "V") * 2, help="two pixels of photos, as observed"
+    )
+    way.add_argument("--answers", type=Path, metavar="FILE", help="where the photos of --pixels were taken")
+    way.add_argument("--calibration", type=Path, metavar="FILE", help="of the camera of --pixels")
+    _add_common(way)
+
+
+def _add_target(way: argparse.ArgumentParser) -> None:
+    way.set_defaults(run=by_target)
+    way.add_argument("--tag", choices=sorted(FAMILIES), help="family of the AprilTags")
+    way.add_argument("--tag-id", type=number(int, 0), metavar="N", help="only this one (default: all)")
+    way.add_argument("--checkerboard", type=number(int, 3), nargs=2, metavar=("COLUMNS", "ROWS"), help="inner corners")
+    way.add_argument(
+        "--size", type=number(float, 1e-6), required=True, metavar="METRES", help="side of the tag, or of a square"
+    )
+    way.add_argument(
+        "--tag-pose",
+        type=_FINITE,
+        nargs=7,
+        metavar=_POSE,
+        help="pose of the tag in the robot's frame: then the whole similarity is found",
+    )
+    way.add_argument(
+        "--scene", type=Path, help="photos with known poses, as for evaluate, in the frame of the map's file"
+    )
+    way.add_argument("--bag", type=Path, help="rosbag2 with photos that were localized, instead of --scene")
+    way.add_argument("--image", metavar="TOPIC", help="of the bag")
+    way.add_argument("--camera-info", metavar="TOPIC", help="of the bag")
+    way.add_argument("--calibration", type=Path, metavar="FILE", help="of a bag without camera_info")
+    way.add_argument("--rectified", action="store_true", help="the images of the bag are rectified")
+    way.add_argument("--answers", type=Path, metavar="FILE", help="where the photos of the bag were taken")
+    _add_scale_limit(way)
+    _add_common(way)
+
+
+def _add_answers(way: argparse.ArgumentParser) -> None:
+    way.add_argument("--answers", type=Path, required=True, metavar="FILE", help="replay's answers.csv, or TUM")
+
+
+def _add_scale_limit(way: argparse._ActionsContainer) -> None:
+    way.add_argument(
+        "--max-scale-sd",
+        type=number(float, 0),
+        default=100 * Precision().scale,
+        metavar="PERCENT",
+        help="largest standard deviation of the scale (default: %(default)g)",
+    )
 
 
 def _add_photos(way: argparse.ArgumentParser) -> None:
@@ -165,7 +190,6 @@ def _add_photos(way: argparse.ArgumentParser) -> None:
 
 
 def _add_trajectory(way: argparse.ArgumentParser) -> None:
-    precision = Precision()
     group = way.add_argument_group("the robot's trajectory")
     group.add_argument("--trajectory", type=Path, metavar="FILE", help="TUM: stamp x y z qx qy qz qw, in metres")
     group.add_argument("--odom", metavar="TOPIC", default="", help="nav_msgs/Odometry of the bag; without it, tf")
@@ -173,7 +197,7 @@ def _add_trajectory(way: argparse.ArgumentParser) -> None:
     group.add_argument("--camera-frame", default="", metavar="NAME", help="default: that of the bag's images")
     group.add_argument(
         "--extrinsics",
-        type=number(float, -np.inf),
+        type=_FINITE,
         nargs=7,
         metavar=_POSE,
         help="pose of the camera's optical frame in the body that the trajectory is of (default: tf; of a file, none)",
@@ -186,17 +210,11 @@ def _add_trajectory(way: argparse.ArgumentParser) -> None:
         metavar="SECONDS",
         help="longest time between two poses between which is interpolated (default: %(default)g)",
     )
-    group.add_argument(
-        "--max-scale-sd",
-        type=number(float, 0),
-        default=100 * precision.scale,
-        metavar="PERCENT",
-        help="largest standard deviation of the scale (default: %(default)g)",
-    )
+    _add_scale_limit(group)
     group.add_argument(
         "--max-angle-sd",
         type=number(float, 0),
-        default=precision.angle,
+        default=Precision().angle,
         metavar="DEGREES",
         help="largest standard deviation of the rotation (default: %(default)g)",
     )
@@ -206,6 +224,9 @@ def _add_trajectory(way: argparse.ArgumentParser) -> None:
 def _add_common(way: argparse.ArgumentParser) -> None:
     way.add_argument("--out", type=Path, required=True, metavar="FILE", help="parameter file to write")
     way.add_argument("--map", type=Path, help="the Gaussian Splatting map, as map.path")
+    way.add_argument(
+        "--params-file", type=Path, metavar="FILE", help="where the map lies now, as a step before wrote it"
+    )
     add_map_options(way)
 
 

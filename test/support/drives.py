@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 
 from gsfeatloc_ros.align.fit import Fit
 from gsfeatloc_ros.align.pairs import Pairs
-from gsfeatloc_ros.common.geometry import invert, make_pose, so3_exp, so3_log
+from gsfeatloc_ros.common.geometry import invert, make_pose, quaternion_from_matrix, so3_exp, so3_log
 from gsfeatloc_ros.maps.similarity import Similarity
 
 
@@ -58,6 +59,16 @@ def error_of(fit: Fit, S_robot_map: Similarity) -> np.ndarray:
     centre = S_robot_map.inverse().transform(fit.centre[None])
     moved = fit.S_robot_map.transform(centre)[0] - fit.centre
     return np.concatenate([[np.log(off.scale)], so3_log(off.rotation), moved])
+
+
+def write_tum(path: Path, poses: np.ndarray, start: float = 100.0) -> Path:
+    """Write poses (N, 4, 4) as TUM, one a second."""
+    lines = [
+        " ".join(f"{value:.9f}" for value in (start + number, *pose[:3, 3], *quaternion_from_matrix(pose[:3, :3])))
+        for number, pose in enumerate(poses)
+    ]
+    path.write_text("# stamp x y z qx qy qz qw\n" + "\n".join(lines) + "\n")
+    return path
 
 
 def _times(count: int) -> np.ndarray:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bags import CAMERA_FRAME, TOPICS, camera_info, image, odometry, pose_stamped, transform, transforms, write_messages
-from drives import Errors, as_pairs, curve, line, random_similarity
+from drives import Errors, as_pairs, curve, line, random_similarity, write_tum
 
 from gsfeatloc_ros.align.pose_files import read_answers, read_tum
 from gsfeatloc_ros.common.geometry import invert, make_pose, quaternion_from_matrix, so3_exp, so3_log
@@ -21,15 +21,6 @@ from gsfeatloc_ros.tools.align import main
 
 # Of the camera on a robot: 20 cm ahead, 40 cm up, looking ahead.
 T_BASE_CAMERA = make_pose([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], [0.2, 0.0, 0.4])
-
-
-def write_tum(path: Path, poses: np.ndarray, start: float = 100.0) -> Path:
-    lines = [
-        " ".join(f"{value:.9f}" for value in (start + number, *pose[:3, 3], *quaternion_from_matrix(pose[:3, :3])))
-        for number, pose in enumerate(poses)
-    ]
-    path.write_text("# stamp x y z qx qy qz qw\n" + "\n".join(lines) + "\n")
-    return path
 
 
 def placed_by(path: Path) -> Similarity:

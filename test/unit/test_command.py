@@ -25,6 +25,8 @@ COMMAND_LINES = {
     "align": [
         "trajectory --answers BAD --trajectory BAD --out OUT",
         "drive BAD --map MAP --image /i --camera-info /c --out OUT",
+        "gravity --map MAP --answers BAD --level --out OUT",
+        "target --scene BAD --tag 36h11 --size 0.1 --out OUT",
     ],
     "warmup": ["--matcher xfeat --weights BAD"],
     "replay": ["BAD --map MAP --image /i --camera-info /c --out OUT"],
