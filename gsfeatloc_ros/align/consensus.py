@@ -78,8 +78,10 @@ def _errors(pairs: Pairs, S_robot_map: Similarity) -> np.ndarray:
 def _near(pairs: Pairs, S_robot_map: Similarity) -> np.ndarray:
     """Return which pairs (N,) are not farther off than the others."""
     near = np.ones(len(pairs), bool)
+    # The best of many samples lies nearer to few pairs than the truth does (Rousseeuw and Leroy, 1987).
+    few = 1 + 5 / (len(pairs) - _SAMPLE)
     parts = residuals(pairs, S_robot_map) if pairs.oriented else residuals(pairs, S_robot_map)[:1]
     for part, least in zip(parts, _LEAST_SIGMAS, strict=False):
         lengths = np.linalg.norm(part, axis=1)
-        near &= lengths <= _MAX_SIGMAS * max(least, float(np.median(lengths)) / _MEDIAN_LENGTH)
+        near &= lengths <= _MAX_SIGMAS * max(least, few * float(np.median(lengths)) / _MEDIAN_LENGTH)
     return near

@@ -45,10 +45,11 @@ def by_trajectory(options: argparse.Namespace) -> Alignment:
 
 def by_drive(options: argparse.Namespace) -> Alignment:
     """Localize the photos of a bag, and fit the answers to a trajectory."""
+    map_ = named_map(options)
     if not options.camera_info and not options.calibration:
         raise ValueError("name the topic of camera_info, or a file with the calibration: --camera-info, --calibration")
     topics = {Role.IMAGE: options.image, Role.CAMERA_INFO: options.camera_info, Role.PRIOR: options.prior}
-    settings = Settings(map=named_map(options), matcher=MatcherSettings(options.matcher, options.weights))
+    settings = Settings(map=map_, matcher=MatcherSettings(options.matcher, options.weights))
     settings = replace(settings, node=replace(settings.node, max_rate=options.max_rate))
     settings = replace(settings, index=replace(settings.index, build=not options.prior))
     settings = replace(settings, image=replace(settings.image, rectified=options.rectified))

@@ -109,7 +109,7 @@ def test_what_cannot_be_used_is_told_in_one_line(files, tmp_path, capsys):
         ([*arguments, "--answers", str(tmp_path / "none.tum")], "none.tum: cannot be read"),
         ([*arguments, "--extrinsics", *"0000000"], "--extrinsics: quaternion"),
         ([*arguments, "--out", str(tmp_path)], "name another file"),
-        ([*arguments, "--map-scale", "0"], "scale 0.0"),
+        ([*arguments, "--map-scale", "0"], "map.scale: 0.0"),
         (["drive", str(tmp_path), "--image", "/image", "--out", str(out)], "--map"),
     ]:
         assert main(changed) == 2, complaint
