@@ -105,7 +105,7 @@ def test_changed_is_of_rejected_images_too_and_not_of_those_without_a_pose(clien
     masks = client.listen(Image, "localizer/changed")
     assert client.spin_until(lambda: client.node.count_publishers("localizer/changed") == 1)
     send_inputs(client, room_camera, photo)
-    assert client.set_parameter("localizer.min_inliers", 5000).successful
+    assert client.set_parameter("localizer.min_inliers", 800).successful
     try:
         image = rgb_image(photo.image)
         assert client.attempt(image).values["status"] == "rejected"

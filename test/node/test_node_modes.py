@@ -78,7 +78,7 @@ def test_parameters_that_cannot_be_set_stay_as_they_are(client, name, value, say
 def test_options_of_the_localizer_change_while_it_runs(client, photo):
     client.send_prior(pose_stamped(photo.T_map_camera_prior))
     # Without a search, which would find no other answer.
-    for name, value in {"localizer.min_inliers": 5000, "localizer.max_views": 0}.items():
+    for name, value in {"localizer.min_inliers": 800, "localizer.max_views": 0}.items():
         assert client.set_parameter(name, value).successful
     refused = client.attempt(rgb_image(photo.image))
     assert refused.values["status"] == "rejected"
