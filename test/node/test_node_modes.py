@@ -82,7 +82,7 @@ def test_options_of_the_localizer_change_while_it_runs(client, photo):
         assert client.set_parameter(name, value).successful
     refused = client.attempt(rgb_image(photo.image))
     assert refused.values["status"] == "rejected"
-    assert "at least 5000 needed" in refused.reason
+    assert "at least 800 needed" in refused.reason
     for name, value in {"localizer.min_inliers": 20, "localizer.max_views": 32}.items():
         assert client.set_parameter(name, value).successful
     assert client.attempt(rgb_image(photo.image)).ok
