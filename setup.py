@@ -16,7 +16,20 @@ superpoint = ["transformers>=5.0,<6"]
 
 # What `ros2 run gsfeatloc_ros NAME` finds, where colcon or bloom installs. A wheel would put names as common as `index`
 # into a user's bin: there they are subcommands of gsfeatloc alone.
-tools = ["align", "benchmark", "demo", "evaluate", "index", "negatives", "parameters", "replay", "soak", "warmup"]
+tools = [
+    "align",
+    "benchmark",
+    "demo",
+    "evaluate",
+    "index",
+    "inspect",
+    "negatives",
+    "parameters",
+    "render",
+    "replay",
+    "soak",
+    "warmup",
+]
 for_ros = {"install", "develop"} & set(sys.argv)
 
 setup(
@@ -27,7 +40,7 @@ setup(
     maintainer_email="gsfeatloc_ros@users.noreply.github.com",
     license="Apache-2.0",
     packages=find_packages(exclude=["test"]),
-    package_data={f"{package_name}.evaluate.report": ["page.html.j2"]},
+    package_data={f"{package_name}.{room}": ["page.html.j2"] for room in ("evaluate.report", "inspect")},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{package_name}"]),
         (f"share/{package_name}", ["package.xml"]),

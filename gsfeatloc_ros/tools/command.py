@@ -15,6 +15,8 @@ from functools import partial
 
 # Names of the tools, modules of this room with `main` and `make_parser`, and what they are for.
 TOOLS = {
+    "inspect": "say what is in a map, and what of it looks wrong for localization",
+    "render": "draw a map from a pose or a path: pictures, depths, a video",
     "index": "make the index of a map's views, which finds images without a prior",
     "align": "find where a map's frame lies in the robot's: scale, rotation, translation",
     "warmup": "compile the kernels and fetch a matcher's weights ahead of use",

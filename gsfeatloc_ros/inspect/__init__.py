@@ -1,0 +1,1 @@
+"""What is in a map, and what of it looks wrong for localization: text, JSON, a page."""
