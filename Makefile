@@ -25,7 +25,7 @@ demo: build
 	@. scripts/env.sh && python -m gsfeatloc_ros.tools.demo
 
 docs: setup
-	@. scripts/env.sh && python -m mkdocs build --quiet && echo "docs: open site/index.html"
+	@. scripts/env.sh && NO_MKDOCS_2_WARNING=1 python -m mkdocs build --quiet && echo "docs: site/index.html; with its search: python3 -m http.server --directory site"
 
 # -P: what is tested is what is installed, not the sources here. Tests of the node mostly wait: apart from those that
 # compute, which would let them wait too long; and those that say in how many seconds it ends, alone.

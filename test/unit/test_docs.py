@@ -20,7 +20,11 @@ FOLDERS = ["gsfeatloc_ros", "test", "docs", "config", "deploy", "scripts", "laun
 # Rooms of the package may be named without it: `render/blend.py`.
 ROOMS = sorted(path.name for path in PACKAGE.iterdir() if path.is_dir() and path.name != "__pycache__")
 # Names that stand for others, and files of other programs.
-NO_FILES = {"gsfeatloc_ros/match/NAME.py", "gsfeatloc_ros/maps/NAME.py", "replay.launch.py", "localizer.launch.py"}
+NO_FILES = {
+    *("gsfeatloc_ros/match/NAME.py", "gsfeatloc_ros/maps/NAME.py", "replay.launch.py", "localizer.launch.py"),
+    *("navigation_launch.py", "localization_launch.py"),  # nav2_bringup's
+    *("simple_trainer.py", "train.py"),  # gsplat's, INRIA's
+}
 each_document = pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
 
 
@@ -78,7 +82,8 @@ def test_anchors_are_githubs() -> None:
 def test_commands_name_modules_with_the_options_given(document: Path) -> None:
     shared = (PACKAGE / "tools/options.py").read_text(encoding="utf-8")
     for code in code_of(document):
-        for module, rest in re.findall(r"python3? -m (gsfeatloc_ros[\w.]*)([^#;)]*)", code):
+        for module, rest in re.findall(r"(?:python3? -m (?=gsfeatloc_ros)|gsfeatloc )([\w.]+)([^#;)]*)", code):
+            module = module if module.startswith("gsfeatloc_ros") else f"gsfeatloc_ros.tools.{module}"
             source = ROOT / (module.replace(".", "/") + ".py")
             assert source.is_file(), module
             text = source.read_text(encoding="utf-8") + shared
@@ -173,6 +178,11 @@ def test_readme_shows_the_example_as_it_is() -> None:
 def test_every_document_is_linked_from_the_readme() -> None:
     linked = {(ROOT / link).resolve() for link in re.findall(r"\]\(([^)#]+)[^)]*\)", DOCUMENTS[0].read_text("utf-8"))}
     assert set(DOCUMENTS[1:]) <= linked
+
+
+def test_every_document_is_in_the_menu_of_the_site() -> None:
+    menu = set(re.findall(r"^ +- .+: (\S+\.md)$", (ROOT / "mkdocs.yml").read_text(encoding="utf-8"), re.MULTILINE))
+    assert {path.name for path in DOCUMENTS[1:]} <= menu
 
 
 def test_the_maintainer_is_the_same_everywhere_and_no_example() -> None:
