@@ -16,7 +16,7 @@ _COVERAGE_CELLS = (8, 6)
 # A right calibration reads as a longer or shorter focal length by at most this share, beside the reading's own
 # standard deviation.
 _MAX_FOCAL_ERROR = 0.01
-_FOCAL_SIGMAS = 2.0
+_FOCAL_SIGMAS = 1.5
 # Of a pose that no prior expects this share of the risk is taken, for a mirror image may be one, unless it is so many
 # times less likely to be wrong than what the photo's mirror image suggests.
 _UNEXPECTED = 1e-8
@@ -24,9 +24,13 @@ _MIRROR_IS_WORSE = 1e-2
 # And this share of one that a prior expects if the mirror image suggests what is less likely to be wrong.
 _MIRRORED = 1e-4
 # What is seen in a picture on a wall or in a mirror, or is one of several, may be somewhere else: at most this share of
-# the photo may be covered or changed, and less for a pose that no prior expects.
+# the photo may be covered or changed, less without a prior, and least where the prior says something else.
 _MAX_CHANGED = 0.7
-_MAX_CHANGED_UNEXPECTED = 0.4
+_MAX_CHANGED_WITHOUT_PRIOR = 0.4
+_MAX_CHANGED_FAR_FROM_PRIOR = 0.2
+# What covers the photo is seldom found in the render. By a wrong calibration a part of the photo fits, and the rest is
+# found beside where it should be: at least this share of the corners that are found agree.
+_MIN_INLIER_RATIO = 0.8
 # The weights of what tells right from wrong answers (docs/trust.md), and what their sum is shifted and scaled by to be
 # the logarithm of the odds that the answer is wrong. The ratio counts by its logit, correlations by Fisher's z.
 _WEIGHTS = {"explained_inlier_ratio": -4.31, "correlation": -5.34, "low_correlation": -7.14}
@@ -164,14 +168,23 @@ def verdict(evidence: Evidence, limits: Limits) -> tuple[str, ...]:
             f"render's agree, {evidence.explained_inlier_ratio:.0%} where both look alike, with a correlation of "
             f"{evidence.correlation:.2f}; {evidence.changed:.0%} of the photo is not as in the map; {evidence.counts}"
         )
-    unexpected = _why_unexpected(evidence, limits)
-    max_changed = _MAX_CHANGED_UNEXPECTED if unexpected else _MAX_CHANGED
+    ratio = float(np.minimum(evidence.inlier_ratio, evidence.render_inlier_ratio))
+    if not ratio >= _MIN_INLIER_RATIO:
+        reasons.append(f"{ratio:.0%} of the corners agree (at least {_MIN_INLIER_RATIO:.0%} needed)")
+    max_changed = _max_changed(evidence, limits)
     if not evidence.changed <= max_changed:
-        most = f"at most {max_changed:.0%}{unexpected}"
+        most = f"at most {max_changed:.0%}{_why_unexpected(evidence, limits)}"
         reasons.append(f"{evidence.changed:.0%} of the photo is not as in the map ({most})")
     if evidence.coverage < limits.min_coverage:
         reasons.append(f"inliers in {evidence.coverage:.0%} of the photo (at least {limits.min_coverage:.0%} needed)")
     return tuple(reasons)
+
+
+def _max_changed(evidence: Evidence, limits: Limits) -> float:
+    """Return how much of the photo may be not as in the map, by what the prior says of the pose."""
+    if evidence.deviation <= limits.max_deviation:
+        return _MAX_CHANGED
+    return _MAX_CHANGED_FAR_FROM_PRIOR if evidence.deviation > limits.max_deviation else _MAX_CHANGED_WITHOUT_PRIOR
 
 
 def _share_of_risk(evidence: Evidence, limits: Limits) -> float:
