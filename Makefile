@@ -24,8 +24,9 @@ help:
 demo: build
 	@. scripts/env.sh && python -m gsfeatloc_ros.tools.demo
 
+# Not --quiet: it would pass over broken links.
 docs: setup
-	@. scripts/env.sh && NO_MKDOCS_2_WARNING=1 python -m mkdocs build --quiet && echo "docs: site/index.html; with its search: python3 -m http.server --directory site"
+	@. scripts/env.sh && NO_MKDOCS_2_WARNING=1 python -m mkdocs build && echo "docs: site/index.html; with its search: python3 -m http.server --directory site"
 
 # -P: what is tested is what is installed, not the sources here. Tests of the node mostly wait: apart from those that
 # compute, which would let them wait too long; and those that say in how many seconds it ends, alone.

@@ -39,7 +39,8 @@ class Links(HTMLParser):
 def site(tmp_path_factory) -> Path:
     """Built as by `make docs`, where a warning is an error: a broken link, an anchor or a page that is in no menu."""
     folder = tmp_path_factory.mktemp("site")
-    command = [sys.executable, "-m", "mkdocs", "build", "--quiet", "--site-dir", str(folder)]
+    # Not --quiet: it would not count warnings, and pass over them.
+    command = [sys.executable, "-m", "mkdocs", "build", "--site-dir", str(folder)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
     return folder
