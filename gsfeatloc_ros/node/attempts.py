@@ -258,6 +258,9 @@ class Attempts:
             outputs.pose_file.take(T_map_camera)
             if judgement.note:
                 outputs.report.note(judgement.note)
+                outputs.report.cross_check.forget()
+            if estimate.covariance is not None:
+                outputs.report.cross_check.take(header, T_map_camera, estimate.covariance)
         elif result.candidates is not None:
             outputs.publishers.publish_candidates(result.candidates)
         outputs.standing.publish_change()

@@ -53,14 +53,14 @@ class Publishers:
         node: whose they are.
         settings: of the node.
         transforms: of the robot.
-        is_lost: whether no transform is to be broadcast, for nobody knows where the robot is.
+        silent: whether no transform is to be broadcast: nobody knows where the robot is, or the map's scale is wrong.
 
     Raises:
         ValueError: a transform is to be broadcast, but tf is not installed, or nobody said that the map is aligned.
     """
 
-    def __init__(self, node: Node, settings: Settings, transforms: Transforms, is_lost: Callable[[], bool]) -> None:
-        self._node, self._is_lost = node, is_lost
+    def __init__(self, node: Node, settings: Settings, transforms: Transforms, silent: Callable[[], bool]) -> None:
+        self._node, self._silent = node, silent
         self._transforms = transforms
         self._map_frame, self._frames = settings.map.frame_id, settings.node.answer_frames()
         self._tolerance = Duration(nanoseconds=int(1e9 * settings.node.transform_tolerance))
@@ -194,6 +194,6 @@ class Publishers:
     def _broadcast(self) -> None:
         with self._broadcast_lock:
             T_map_odom = self._T_map_odom
-            if T_map_odom is not None and not self._is_lost():
+            if T_map_odom is not None and not self._silent():
                 stamp = (self._node.get_clock().now() + self._tolerance).to_msg()
                 self._transforms.broadcast(self._map_frame, self._frames.odom, T_map_odom, stamp)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 from builtin_interfaces.msg import Time
 
+from gsfeatloc_ros.crosscheck.fit import Cause
 from gsfeatloc_ros.node.diagnostics import (
     ERROR,
     LEVELS,
@@ -20,6 +21,7 @@ from gsfeatloc_ros.node.diagnostics import (
     stamp_text,
 )
 from gsfeatloc_ros.ros_io.camera_health import CameraHealth
+from gsfeatloc_ros.ros_io.cross_check import CrossCheck
 from gsfeatloc_ros.ros_io.outcome import Outcome, OutcomeStatus
 
 # Seconds over which rates and shares are counted, and most images and attempts in them.
@@ -123,21 +125,29 @@ class Report:
     Args:
         reporter: that writes it.
         dropped: number of images that gave way to others.
+        cross_check: of the answers by odometry.
 
     Attributes:
         health: of the session.
         camera: what is known of the calibration of the camera on the topic.
+        cross_check: see there.
         images: number of images that came.
         answers: number of answers that were published.
     """
 
-    def __init__(self, reporter: Reporter, dropped: Callable[[], int]) -> None:
-        self._reporter = reporter
+    def __init__(self, reporter: Reporter, dropped: Callable[[], int], cross_check: CrossCheck) -> None:
+        self._reporter, self.cross_check = reporter, cross_check
         self._dropped = dropped
         self.health = Health()
         self.camera = CameraHealth()
+        self._said = ""
         self.images = 0
         self.answers = 0
+
+    @property
+    def wrong_scale(self) -> str:
+        """What odometry says of a scale of the map that it contradicts; empty where it does not."""
+        return self._wrong()[1] if self._wrong()[0] == Cause.SCALE.value else ""
 
     def count_image(self) -> None:
         """Count an image that came."""
@@ -187,11 +197,24 @@ class Report:
 
     def publish_health(self, level: bytes, reason: str, about: dict[str, str]) -> None:
         """Publish how the session does, with what there is to know about it; a wrong calibration explains much."""
-        warning = self.camera.warning
+        subject, warning = self._wrong()
+        if subject != self._said:
+            self._said = subject
+            self._reporter.say(warning or "what did not fit the camera or the odometry fits now")
         if warning and level != ERROR:
             level, reason = WARN, warning
-        texts = about | self.health.texts() | self.camera.texts()
+        texts = about | self.health.texts() | self.camera.texts() | self.cross_check.texts()
         self._reporter.diagnose("health", level, reason, texts | self._counts)
+
+    def _wrong(self) -> tuple[str, str]:
+        """Return the subject of what is wrong with what was declared, and a sentence; empty where nothing is.
+
+        A wrong focal length moves all answers, and explains whatever odometry says of them.
+        """
+        if self.camera.warning:
+            return "focal length", self.camera.warning
+        cause = self.cross_check.cause
+        return ("", "") if cause is None else (cause.value, self.cross_check.warning)
 
     def _diagnose(self, level: bytes, status: str, reason: str, values: dict[str, str]) -> None:
         said = {"status": status, "reason": reason}

@@ -18,6 +18,7 @@ from gsfeatloc_ros.node.reception import Reception
 from gsfeatloc_ros.node.report import Report
 from gsfeatloc_ros.node.standing import StandingPublisher
 from gsfeatloc_ros.node.transforms import Transforms
+from gsfeatloc_ros.ros_io.cross_check import CrossCheck
 from gsfeatloc_ros.ros_io.follower import Follower
 from gsfeatloc_ros.ros_io.inputs import Inputs
 from gsfeatloc_ros.ros_io.pictures import PictureReader
@@ -65,9 +66,6 @@ class Session:
         self.settings = settings
         self.active = self.closed = False
         state = LocalizationState(settings.recovery.state, lambda: node.get_clock().now().nanoseconds)
-        self._publishers = Publishers(node, settings, transforms, lambda: state.standing().state is State.LOST)
-        self._standing = StandingPublisher(node, state, reporter)
-        self.report = Report(reporter, lambda: self.attempts.dropped)
         inputs = Inputs(
             settings.prior_policy(),
             transforms.lookup,
@@ -76,6 +74,17 @@ class Session:
             PictureReader(settings.image.bits, reporter.info),
         )
         self.inputs, self._follower = inputs, Follower(inputs, state, settings.node.track)
+        cross_check = CrossCheck(inputs, settings.crosscheck, settings.map.scale)
+        self.report = Report(reporter, lambda: self.attempts.dropped, cross_check)
+
+        def withheld() -> str:
+            return self.report.wrong_scale if settings.node.publish_tf else ""
+
+        def silent() -> bool:
+            return state.standing().state is State.LOST or bool(withheld())
+
+        self._publishers = Publishers(node, settings, transforms, silent)
+        self._standing = StandingPublisher(node, state, reporter, withheld)
         self._pose_file = PoseFile(settings.state.path, settings.map, reporter)
         self._use_saved_pose()
         outputs = Outputs(self._publishers, self._standing, self._pose_file, self.report)
@@ -118,6 +127,7 @@ class Session:
         self.active = self.attempts.publishing = False
         self.reception.stop_listening()
         self._follower.lose("the node was deactivated", with_priors=False)
+        self.report.cross_check.forget()
         self._publishers.forget()
         self._pose_file.save()
 
@@ -141,6 +151,7 @@ class Session:
     def lose(self, reason: str) -> None:
         """Forget where the robot is: it is anywhere in the map."""
         self._follower.lose(reason, with_priors=True)
+        self.report.cross_check.forget()
         self._publishers.forget()
         self._standing.publish()
 
@@ -148,6 +159,7 @@ class Session:
         """Go on with the map of another engine; the last answer was in the old one's."""
         self.attempts.use_map(engine)
         self._follower.lose("the map was changed", with_priors=False)
+        self.report.cross_check.reset()
         self._publishers.forget()
         self._standing.publish()
         self._pose_file.use_map(self.settings.map)
@@ -169,6 +181,7 @@ class Session:
         self._transforms.forget()
         self.inputs.forget_after(stamp)
         self._follower.lose("time went back", with_priors=False)
+        self.report.cross_check.forget()
         self._publishers.forget()
 
     def _tell_reading(self) -> None:

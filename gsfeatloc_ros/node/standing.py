@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from threading import Lock
 
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -24,10 +25,11 @@ class StandingPublisher:
         node: whose topic it is.
         state: that is published.
         reporter: writes to the log and to /diagnostics.
+        withheld: why no transform is broadcast although the robot is localized; empty where one is.
     """
 
-    def __init__(self, node: Node, state: LocalizationState, reporter: Reporter) -> None:
-        self._node, self._state, self._reporter = node, state, reporter
+    def __init__(self, node: Node, state: LocalizationState, reporter: Reporter, withheld: Callable[[], str]) -> None:
+        self._node, self._state, self._reporter, self._withheld = node, state, reporter, withheld
         self._publisher = node.create_publisher(DiagnosticStatus, "~/state", LAST, qos_overriding_options=overridable())
         self._lock = Lock()
         self._last: State | None = None
@@ -53,11 +55,15 @@ class StandingPublisher:
         if standing.state is not self._last and State.LOST in (standing.state, self._last):
             self._reporter.info(f"{standing.state.value}: {standing.reason}")
         self._last = standing.state
+        withheld, level = self._withheld(), _LEVELS[standing.state]
+        reason = f"{standing.reason}; no transform is broadcast: {withheld}" if withheld else standing.reason
         values = {
-            "reason": standing.reason,
+            "reason": reason,
             "seconds": f"{standing.seconds:.1f}",
             "failures": str(standing.failures),
         }
-        level, state = _LEVELS[standing.state], standing.state.value
+        state = standing.state.value
+        if withheld and level == OK:
+            level = WARN
         self._publisher.publish(status_message(self._node, "state", level, state, values))
-        self._reporter.diagnose("state", level, f"{state}: {standing.reason}", {"state": state} | values)
+        self._reporter.diagnose("state", level, f"{state}: {reason}", {"state": state} | values)

@@ -42,6 +42,7 @@ class CameraHealth:
 
     def __init__(self) -> None:
         self._calibration: tuple[object, ...] | None = None
+        self._K = np.eye(3)
         self._readings: deque[tuple[float, float]] = deque(maxlen=_MAX_READINGS)
 
     def take(self, camera: Camera, estimate: Estimate) -> None:
@@ -49,6 +50,7 @@ class CameraHealth:
         calibration = (camera.width, camera.height, camera.model, camera.K.tobytes(), camera.distortion.tobytes())
         if calibration != self._calibration:
             self._calibration, self._readings = calibration, deque(maxlen=_MAX_READINGS)
+            self._K = camera.K
         error, sigma = estimate.evidence.focal_error, estimate.evidence.focal_sigma
         if (estimate.localized or _is_refused_for_focal_length(estimate)) and np.isfinite(error) and sigma > 0:
             self._readings.append((error, sigma))
@@ -71,9 +73,11 @@ class CameraHealth:
         focal = self.focal_length
         if focal.count < _MIN_READINGS or not abs(focal.error) > max(_MIN_ERROR, _MIN_SIGMAS * focal.sigma):
             return ""
+        fx, fy = np.diag(self._K)[:2]
         return (
             f"the focal length fits {100 * abs(focal.error):.1f} +- {100 * focal.sigma:.1f} % "
-            f"{'longer' if focal.error > 0 else 'shorter'} than camera_info says, by {focal.count} answers: "
+            f"{'longer' if focal.error > 0 else 'shorter'} than camera_info says, by {focal.count} answers "
+            f"(fx {(1 + focal.error) * fx:.1f}, fy {(1 + focal.error) * fy:.1f}, not {fx:.1f}, {fy:.1f}): "
             "is camera_info of this stream?"
         )
 

@@ -221,6 +221,20 @@ class Inputs:
             if self._prior is _NOTHING:
                 self._prior = _Newest(saved)
 
+    @property
+    def odometry(self) -> OdometryBuffer:
+        """The newest odometry."""
+        return self._odometry
+
+    @property
+    def odometry_body(self) -> str:
+        """Frame of the body whose poses odometry gives; empty where none came."""
+        return self._odometry_frames[1]
+
+    def camera_on_body(self, camera_frame: str, stamp: int) -> np.ndarray:
+        """Return T_body_camera (4, 4) on that body at `stamp` (nanoseconds); raise ValueError where it is not known."""
+        return self._transform(self.odometry_body, camera_frame, stamp)
+
     def has_odometry(self, stamp: int) -> bool:
         """Return whether odometry says where the robot was at `stamp` (nanoseconds)."""
         return self._odometry.between(stamp, stamp) is not None
@@ -300,16 +314,12 @@ class Inputs:
             self._odometry_frames = frames
         self._odometry.add(nanoseconds(message.header.stamp), pose)
 
-    @property
-    def _odometry_body(self) -> str:
-        return self._odometry_frames[1]
-
     def _readout(self, stamp: int, camera_frame: str, rows: int) -> np.ndarray | None:
         """Return how the camera moved (6,) while it read the rows of an image; None where that is not known."""
         velocity = self._odometry.velocity(stamp) if stamp and self.line_delay else None
         if velocity is None:
             return None
-        T_body_camera = self._transform(self._odometry_body, camera_frame, stamp)
+        T_body_camera = self.camera_on_body(camera_frame, stamp)
         linear, angular = velocity[:3] + np.cross(velocity[3:], T_body_camera[:3, 3]), velocity[3:]
         in_camera = np.concatenate([linear @ T_body_camera[:3, :3], angular @ T_body_camera[:3, :3]])
         return rows * self.line_delay * in_camera
@@ -335,7 +345,7 @@ class Inputs:
         age = 1e-9 * (stamp - prior.stamp)
         way = self._odometry.between(prior.stamp, stamp) if abs(age) <= policy.odometry_max_age else None
         if way is not None:
-            T_body_camera = self._transform(self._odometry_body, camera_frame, stamp)
+            T_body_camera = self.camera_on_body(camera_frame, stamp)
             pose = pose @ invert(T_body_camera) @ way.motion @ T_body_camera
             return pose, self._grown(covariance, policy.growth.by_odometry(way.travelled))
         if not prior.source.own and policy.max_age and -age > policy.max_age:

@@ -88,6 +88,11 @@ class OdometryBuffer:
         distance, turn = np.abs(second - first).tolist()
         return Way(invert(at_start) @ at_end, Travelled(distance, turn))
 
+    def pose(self, stamp: int) -> np.ndarray | None:
+        """Return the pose T_odom_body (4, 4) at `stamp` (nanoseconds); None as of `between`."""
+        with self._lock:
+            return self._at(stamp)
+
     def velocity(self, stamp: int) -> np.ndarray | None:
         """Return how the body moves at `stamp` (nanoseconds): (6,) metres and radians a second, in its own axes.
 

@@ -13,6 +13,7 @@ from gsfeatloc_ros.common.paths import local_path
 from gsfeatloc_ros.index import IndexOptions
 from gsfeatloc_ros.localize.options import LocalizerOptions
 from gsfeatloc_ros.localize.settings import CpuSettings, MapSettings, MatcherSettings, RendererSettings
+from gsfeatloc_ros.ros_io.cross_check import CrossCheckOptions
 from gsfeatloc_ros.ros_io.decode import frame_name
 from gsfeatloc_ros.ros_io.extrinsics import AnswerFrames
 from gsfeatloc_ros.ros_io.growth import GrowthOptions
@@ -169,6 +170,7 @@ class Settings:
     requests: RequestSettings = field(default_factory=RequestSettings)
     recovery: RecoverySettings = field(default_factory=RecoverySettings)
     state: StateSettings = field(default_factory=StateSettings)
+    crosscheck: CrossCheckOptions = field(default_factory=CrossCheckOptions)
     index: IndexOptions = field(default_factory=IndexOptions)
 
     @staticmethod
@@ -190,6 +192,7 @@ class Settings:
             requests=settings_from(RequestSettings, values, "requests."),
             recovery=settings_from(RecoverySettings, values, "search."),
             state=settings_from(StateSettings, values, "state."),
+            crosscheck=settings_from(CrossCheckOptions, values, "crosscheck."),
             index=settings_from(IndexOptions, values, "index."),
         )
 
@@ -256,6 +259,7 @@ _GROUPS = {
     "requests.": RequestSettings,
     "search.": RecoverySettings,
     "state.": StateSettings,
+    "crosscheck.": CrossCheckOptions,
     "index.": IndexOptions,
 }
 _PREFIXES = list(_GROUPS)

@@ -56,6 +56,8 @@ _GROUP_HEADS = {
     "requests": "## requests\n\nHow many requests are taken: [Services](topics-and-services.md#services).",
     "search": "## search\n\nHow a robot is followed and found again: [State](topics-and-services.md#state).",
     "state": "## state\n\nWhat is kept for the next start.",
+    "crosscheck": "## crosscheck\n\nAnswers are held against odometry: "
+    "[It watches itself](topics-and-services.md#it-watches-itself).",
     "index": "## index\n\nThe view index.",
 }
 _TYPES = {bool: "bool", int: "integer", float: "double", str: "string", tuple: "double array"}

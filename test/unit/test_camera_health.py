@@ -74,8 +74,10 @@ def test_its_deviation_is_that_of_the_mean(scatter):
 @pytest.mark.parametrize(("error", "way"), [(0.02, "longer"), (-0.02, "shorter")])
 def test_a_wrong_calibration_is_named(error, way):
     health = filled([error] * 40, 0.019)
+    fits = 500 * (1 + error)
     assert health.warning == (
-        f"the focal length fits 2.0 +- 0.3 % {way} than camera_info says, by 40 answers: is camera_info of this stream?"
+        f"the focal length fits 2.0 +- 0.3 % {way} than camera_info says, by 40 answers (fx {fits:.1f}, fy {fits:.1f}, "
+        "not 500.0, 500.0): is camera_info of this stream?"
     )
     assert health.texts() == {"focal_error": f"{error:.4f}", "focal_sigma": "0.0030", "focal_answers": "40"}
 
