@@ -25,6 +25,7 @@ tools = [
     "inspect",
     "negatives",
     "parameters",
+    "prepare",
     "render",
     "replay",
     "soak",

@@ -12,11 +12,8 @@ import yaml
 from gsfeatloc_ros.common.geometry import quaternion_from_matrix
 from gsfeatloc_ros.common.parameter import parameters_of, values_of
 from gsfeatloc_ros.common.replaced_file import replaced_file
-from gsfeatloc_ros.localize.settings import MapSettings
+from gsfeatloc_ros.localize.settings import PLACE, MapSettings
 from gsfeatloc_ros.maps.similarity import Similarity
-
-# Always written, others only where they are not the default.
-_PLACE = ("map.aligned", "map.scale", "map.translation", "map.rotation")
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +47,7 @@ class Alignment:
         )
         # As the node will.
         for parameter in parameters_of(MapSettings, "map."):
-            if parameter.name in _PLACE:
+            if parameter.name in PLACE:
                 parameter.converted(values_of(placed, "map.")[parameter.name])
         return placed
 
@@ -64,7 +61,8 @@ def write_parameters(path: Path, map_: MapSettings, comments: Sequence[str]) -> 
     default = values_of(MapSettings(), "map.")
     tree: dict[str, Any] = {}
     for name, value in values_of(map_, "map.").items():
-        if name in _PLACE or value != default[name]:
+        # Others only where they are not the default.
+        if name in PLACE or value != default[name]:
             tree[name.removeprefix("map.")] = list(value) if isinstance(value, tuple) else value
     content = yaml.safe_dump({"/**": {"ros__parameters": {"map": tree}}}, sort_keys=False, default_flow_style=None)
     with replaced_file(path) as file:

@@ -145,7 +145,7 @@ def map_now(options: argparse.Namespace) -> MapSettings:
     values = read_parameter_file(options.params_file) if options.params_file else {}
     given, default = values_of(options.map_given, "map."), values_of(MapSettings(), "map.")
     values |= {name: value for name, value in given.items() if value != default[name]}
-    return Settings.checked(values).map
+    return Settings.checked(values).map.resolved()
 
 
 def named_map(options: argparse.Namespace) -> MapSettings:

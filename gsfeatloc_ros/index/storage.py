@@ -15,6 +15,7 @@ from gsfeatloc_ros.common.kernel_cache import can_write, user_cache_folder
 from gsfeatloc_ros.common.replaced_file import replaced_file
 from gsfeatloc_ros.common.safe_files import UntrustedError, open_own
 from gsfeatloc_ros.index.view_index import CODE_BYTES, ViewIndex
+from gsfeatloc_ros.maps.bundle import map_in
 
 SUFFIX = ".gsfeatloc-index"
 
@@ -41,9 +42,12 @@ _SIZES = {"N": (1, 1_000_000), "F": (1, 2**31 - 1), "L": (1, 2**31 - 1), "D": (1
 def index_path(map_path: str | Path) -> Path:
     """Return where the index of a map is kept: beside it, or in the user's cache where that cannot be written.
 
-    One that lies beside the map already is taken where it is.
+    One that lies beside the map already is taken where it is. Of a bundle it is beside the map in it.
+
+    Raises:
+        MapError: the manifest of a bundle cannot be used.
     """
-    path = Path(os.path.abspath(map_path))
+    path = Path(os.path.abspath(map_in(map_path)))
     beside = path.with_name(path.name + SUFFIX)
     if beside.exists() or can_write(path.parent):
         return beside

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from gsfeatloc_ros.common.device import DEVICES
-from gsfeatloc_ros.common.geometry import matrix_from_quaternion
-from gsfeatloc_ros.common.parameter import parameter
-from gsfeatloc_ros.maps import ReadOptions, Similarity, read_dataparser_transforms
+from gsfeatloc_ros.common.geometry import matrix_from_quaternion, quaternion_from_matrix
+from gsfeatloc_ros.common.parameter import Value, parameter, parameters_of, settings_from, values_of
+from gsfeatloc_ros.maps import MapError, ReadOptions, Similarity, read_dataparser_transforms
+from gsfeatloc_ros.maps.bundle import MANIFEST, read_bundle
 from gsfeatloc_ros.match import DEFAULT_MATCHER, DEFAULT_MAX_FEATURES, MATCHERS
 
 
@@ -21,7 +22,7 @@ class MapSettings:
         "",
         "Path of the map (required): "
         "a .ply, compressed .ply, .splat, .spz or .sog, or the folder of an unbundled or streamed .sog, of gsplat's "
-        "PNG images or of the INRIA trainer's output.",
+        "PNG images or of the INRIA trainer's output; or a map bundle, made by gsfeatloc prepare.",
         live=True,
     )
     frame_id: str = parameter("map", "Name of the map's frame, in which answers are given.")
@@ -56,6 +57,61 @@ class MapSettings:
         if not self.dataparser_transforms:
             return alignment
         return alignment @ read_dataparser_transforms(self.dataparser_transforms)
+
+    def resolved(self) -> MapSettings:
+        """Return the same with what a map bundle says where nothing else was given; of another map, itself.
+
+        Raises:
+            MapError: the bundle cannot be used, or says other than what was given; the message says what.
+        """
+        bundle = read_bundle(self.path) if self.path else None
+        if bundle is None:
+            return self
+        bundle.check_alignment()
+        given, default = values_of(self, "map."), values_of(MapSettings(), "map.")
+        known = {item.name: item for item in parameters_of(MapSettings, "map.") if item.name not in _NOT_BUNDLED}
+        for name, value in bundle.parameters.items():
+            if name not in known:
+                raise MapError(f"{self.path}/{MANIFEST}: has a parameter that no bundle has: {name!r}")
+            try:
+                says = known[name].converted(value)
+            except ValueError as error:
+                raise MapError(f"{self.path}/{MANIFEST}: {error}") from error
+            if given[name] not in (default[name], says):
+                raise MapError(
+                    f"parameter {name}: {given[name]} was given, and the bundle {self.path} says {says}: leave it out, "
+                    "or make the bundle anew"
+                )
+            given[name] = says
+        if bundle.parameters.keys() & PLACE and self.dataparser_transforms:
+            raise MapError(
+                f"parameter map.dataparser_transforms: {self.dataparser_transforms} was given, and the bundle "
+                f"{self.path} has its alignment: leave it out, or make the bundle anew"
+            )
+        return settings_from(MapSettings, given, "map.")
+
+    def bundled(self) -> dict[str, Value]:
+        """Return the parameters that a bundle of this map says: what nerfstudio's file says is part of the alignment.
+
+        Raises:
+            ValueError: the map lies nowhere; the message says why.
+        """
+        placed = self
+        if self.dataparser_transforms:
+            alignment = self.alignment()
+            rotation = tuple(quaternion_from_matrix(alignment.rotation).tolist())
+            translation = tuple(alignment.translation.tolist())
+            placed = replace(self, scale=alignment.scale, rotation=rotation, translation=translation)
+        default, values = values_of(MapSettings(), "map."), values_of(placed, "map.")
+        said = {name for name, value in values.items() if value != default[name] and name not in _NOT_BUNDLED}
+        if said & set(PLACE):
+            said |= set(PLACE)
+        return {name: value for name, value in values.items() if name in said}
+
+
+# Where a map lies: a bundle says all of these or none.
+PLACE = ("map.aligned", "map.scale", "map.translation", "map.rotation")
+_NOT_BUNDLED = ("map.path", "map.dataparser_transforms", "map.cache")
 
 
 @dataclass(frozen=True)

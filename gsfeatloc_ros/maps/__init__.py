@@ -7,6 +7,7 @@ import zlib
 from pathlib import Path
 
 from gsfeatloc_ros.maps.assemble import read_packed
+from gsfeatloc_ros.maps.bundle import read_bundle
 from gsfeatloc_ros.maps.files import find_map
 from gsfeatloc_ros.maps.foreign import (
     HEAD_BYTES,
@@ -52,14 +53,18 @@ def load_map(
     Args:
         path: a .ply in the layout of the INRIA trainer, gsplat and nerfstudio; a compressed .ply of PlayCanvas; a
             .splat; an .spz; a .sog, or the folder or meta.json of an unbundled one or of gsplat's PngCompression; the
-            folder or lod-meta.json of a streamed .sog; the output folder of the INRIA trainer.
+            folder or lod-meta.json of a streamed .sog; the output folder of the INRIA trainer; a map bundle, of which
+            the map alone is taken, after a look whether it is whole: MapSettings(path).resolved() has the rest.
         alignment: where the frame of the file lies in the robot's map frame; without it that is the robot's.
         options: what the file may leave open.
 
     Raises:
         MapError: the file cannot be used; the message names it, what is wrong and what to do.
     """
-    path = Path(path)
+    bundle = read_bundle(path)
+    if bundle is not None:
+        bundle.check_map()
+    path = Path(path) if bundle is None else bundle.map
     try:
         found = find_map(path)
         gaussian_map = _read(found, options)

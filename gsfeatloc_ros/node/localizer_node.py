@@ -130,8 +130,8 @@ class LocalizerNode(LifecycleNode):
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Load the map, compile, be ready to listen; log why where that fails."""
-        settings = self._settings
         try:
+            settings = load(self._settings.resolved, self._go_on)
             engine = load(
                 lambda: load_engine(settings.map, settings.matcher, settings.renderer, settings.localizer), self._go_on
             )

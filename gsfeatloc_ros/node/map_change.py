@@ -11,6 +11,7 @@ from rclpy.parameter import Parameter
 from gsfeatloc_ros.common.paths import local_path
 from gsfeatloc_ros.common.words import in_one_line
 from gsfeatloc_ros.localize.engine import Engine, load_renderer
+from gsfeatloc_ros.localize.settings import MapSettings
 from gsfeatloc_ros.node.diagnostics import ERROR, OK, Reporter
 from gsfeatloc_ros.node.loading import load
 from gsfeatloc_ros.node.session import Session
@@ -54,25 +55,28 @@ class MapChange:
 
     def _load(self, session: Session, settings: Settings) -> None:
         """Load the map beside the executor's thread, and have that use it or go back to the old one."""
-        loaded: Engine | Exception
+        loaded: tuple[Engine, MapSettings] | Exception
         try:
-            renderer = load(lambda: load_renderer(settings.map, settings.renderer), lambda: not session.closed)
-            loaded = session.engine.with_map(settings.map.path, renderer)
+            map_ = load(settings.map.resolved, lambda: not session.closed)
+            _check_names(session.settings.map, map_)
+            renderer = load(lambda: load_renderer(map_, settings.renderer), lambda: not session.closed)
+            loaded = session.engine.with_map(map_.path, renderer), map_
         except Exception as error:  # whatever it is, the old map serves on
             loaded = error
         executor = self._node.executor
         assert executor is not None  # it has set the parameter
         executor.create_task(self._finish, session, loaded)
 
-    def _finish(self, session: Session, loaded: Engine | Exception) -> None:
+    def _finish(self, session: Session, loaded: tuple[Engine, MapSettings] | Exception) -> None:
         self._loading = ""
         if session.closed:
             return
-        if isinstance(loaded, Engine):
-            session.use_map(loaded)
-            reason = f"the map is now {loaded.map_path}"
+        if not isinstance(loaded, Exception):
+            engine, map_ = loaded
+            session.use_map(engine, map_)
+            reason = f"the map is now {engine.map_path}"
             self._node.get_logger().info(reason)
-            self._reporter.diagnose("map", OK, reason, {"map": loaded.map_path})
+            self._reporter.diagnose("map", OK, reason, {"map": engine.map_path})
             return
         old = session.engine.map_path
         reason = f"the map is still {old}: {in_one_line(loaded)}"
@@ -81,3 +85,13 @@ class MapChange:
         self._going_back = True
         self._node.set_parameters([Parameter(PATH, value=old)])
         self._going_back = False
+
+
+def _check_names(old: MapSettings, new: MapSettings) -> None:
+    """Raise ValueError where a bundle says other than the map before what holds as long as the node is configured."""
+    for name in ("frame_id", "aligned"):
+        before, after = getattr(old, name), getattr(new, name)
+        if before != after:
+            raise ValueError(
+                f"parameter map.{name}: it is {before}, and the bundle {new.path} says {after}: start the node with it"
+            )

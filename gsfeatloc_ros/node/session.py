@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
 from gsfeatloc_ros.localize.engine import Engine
+from gsfeatloc_ros.localize.settings import MapSettings
 from gsfeatloc_ros.node.attempts import Attempts, Outputs
 from gsfeatloc_ros.node.diagnostics import OK, Reporter
 from gsfeatloc_ros.node.graph import GraphWatch
@@ -155,8 +157,9 @@ class Session:
         self._publishers.forget()
         self._standing.publish()
 
-    def use_map(self, engine: Engine) -> None:
-        """Go on with the map of another engine; the last answer was in the old one's."""
+    def use_map(self, engine: Engine, map_: MapSettings) -> None:
+        """Go on with the map of another engine, and where it lies; the last answer was in the old one's."""
+        self.settings = replace(self.settings, map=map_)
         self.attempts.use_map(engine)
         self._follower.lose("the map was changed", with_priors=False)
         self.report.cross_check.reset()
@@ -167,8 +170,8 @@ class Session:
         self._index_build.start(self.settings)
 
     def use_settings(self, settings: Settings) -> None:
-        """Go on with other settings, but for those that are read when the node is configured."""
-        self.settings = settings
+        """Go on with other settings, but for the map's, and those that are read when the node is configured."""
+        self.settings = settings = replace(settings, map=self.settings.map)
         self.inputs.policy = settings.prior_policy()
         self.inputs.line_delay = settings.image.line_delay
         self._follower.state.options = settings.recovery.state

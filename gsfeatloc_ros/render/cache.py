@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import hashlib
 import json
 import logging
 import math
@@ -17,9 +16,10 @@ import numpy as np
 
 from gsfeatloc_ros.common.kernel_cache import hash_of_sources
 from gsfeatloc_ros.common.replaced_file import replaced_file
-from gsfeatloc_ros.common.safe_files import open_own, open_regular
+from gsfeatloc_ros.common.safe_files import open_own
 from gsfeatloc_ros.maps import MapError, Reading, ReadOptions, Similarity, load_map
-from gsfeatloc_ros.maps.files import map_files
+from gsfeatloc_ros.maps.bundle import read_bundle
+from gsfeatloc_ros.maps.files import content_of, map_files
 from gsfeatloc_ros.maps.gaussian_map import SH_COEFFICIENTS
 from gsfeatloc_ros.render.prepare import CHUNK, LOG2_OPACITY, MEAN_X, MEAN_Z, ROWS, PreparedMap, prepare
 
@@ -55,16 +55,19 @@ def load_prepared(
     Args:
         path, options: as for load_map.
         alignment: as for load_map; it is no part of the cache.
-        cache_path: file of the cache; None for the map's name and SUFFIX, in the same folder. That it cannot be
-            written is no error.
+        cache_path: file of the cache; None for the map's name and SUFFIX, in the same folder; of a bundle, in it. That
+            it cannot be written is no error.
 
     Raises:
         MapError: the map cannot be used.
     """
-    path = Path(path)
+    bundle = read_bundle(path)
+    path = Path(path) if bundle is None else bundle.map
     absolute = Path(os.path.abspath(path))
     cache_path = absolute.with_name(absolute.name + SUFFIX) if cache_path is None else Path(cache_path)
-    content = [_content(file) for file in map_files(absolute)]
+    content = [content_of(file) for file in map_files(absolute)]
+    if bundle is not None:
+        bundle.check_map(content)
     origin = {"code": _code(), "map": content, "options": asdict(options)}
     prepared = _read_if_usable(cache_path, origin)
     if prepared is None:
@@ -170,28 +173,19 @@ def _checksum(header: bytes, arrays: dict[str, np.ndarray]) -> int:
 def map_content(path: str | Path) -> list[Any]:
     """Return what tells the content of a map from that of others: size and SHA-256 of each of its files.
 
-    It is the same for a copy under another name.
+    It is the same for a copy under another name. Of a map in a bundle it is what the manifest says: those that load
+    the map check it.
 
     Raises:
         MapError: the map cannot be read.
     """
+    bundle = read_bundle(path)
+    if bundle is not None:
+        return bundle.map_content
     files = map_files(Path(os.path.abspath(path)))
     if not files:
         raise MapError(f"{path}: cannot be read: there is no such map")
-    return [_content(file) for file in files]
-
-
-def _content(file: Path) -> list[Any]:
-    """Return the size in bytes and the SHA-256 of a file: 0.15 s for a map of a million Gaussians, 236 MB.
-
-    Raises:
-        MapError: the file cannot be read.
-    """
-    try:
-        with open_regular(file) as stream:
-            return [os.fstat(stream.fileno()).st_size, hashlib.file_digest(stream, "sha256").hexdigest()]
-    except OSError as error:
-        raise MapError(f"{file}: cannot be read: {error.strerror or error}") from error
+    return [content_of(file) for file in files]
 
 
 @functools.cache

@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import logging
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from gsfeatloc_ros.common.parameter import Parameter, Value, parameter, parameters_of, settings_from
@@ -195,6 +195,10 @@ class Settings:
             crosscheck=settings_from(CrossCheckOptions, values, "crosscheck."),
             index=settings_from(IndexOptions, values, "index."),
         )
+
+    def resolved(self) -> Settings:
+        """Return the same with what a map bundle says of its map; raise ValueError where that cannot be used."""
+        return replace(self, map=self.map.resolved())
 
     def prior_policy(self) -> PriorPolicy:
         """Return what priors are worth."""

@@ -18,6 +18,7 @@ TOOLS = {
     "inspect": "say what is in a map, and what of it looks wrong for localization",
     "render": "draw a map from a pose or a path: pictures, depths, a video",
     "index": "make the index of a map's views, which finds images without a prior",
+    "prepare": "put a map and all that a robot needs of it into one folder",
     "align": "find where a map's frame lies in the robot's: scale, rotation, translation",
     "warmup": "compile the kernels and fetch a matcher's weights ahead of use",
     "replay": "localize the images of a recorded bag as the node would, without ROS",

@@ -24,8 +24,9 @@ from gsfeatloc_ros.index.storage import index_path, save_index
 from gsfeatloc_ros.localize.engine import load_matcher, load_renderer
 from gsfeatloc_ros.localize.map_index import index_key
 from gsfeatloc_ros.localize.settings import MatcherSettings, RendererSettings
+from gsfeatloc_ros.maps import Similarity
 from gsfeatloc_ros.match import MATCHERS
-from gsfeatloc_ros.render import DEVICES
+from gsfeatloc_ros.render import DEVICES, Renderer
 from gsfeatloc_ros.tools.options import add_map_options, map_settings, number, print_reading
 from gsfeatloc_ros.tools.status import run_tool
 
@@ -49,18 +50,40 @@ def _index(options: argparse.Namespace) -> int:
 
 def _make(options: argparse.Namespace) -> tuple[Path, ViewIndex]:
     """Make the index that the options ask for, and write it; return where it is."""
-    map_, matcher = map_settings(options), MatcherSettings(options.matcher, options.weights)
-    key, placed = index_key(map_.path, map_, matcher), map_.alignment()
+    map_ = map_settings(options).resolved()
+    key = index_key(map_.path, map_, matcher_settings(options))
     path = options.out or index_path(map_.path)
     # Now, not after minutes.
     if path.is_dir() or not can_write(path.absolute().parent):
         raise ValueError(f"{path}: cannot be written: name another file (--out)")
-    poses = None
-    if options.poses:
-        poses = np.array([placed.transform_pose(pose) for pose in load_poses(options.poses)])
+    poses = training_poses(options, map_.alignment())
     renderer = load_renderer(map_, RendererSettings(options.device, options.threads))
     print_reading("index", renderer)
-    features = load_matcher(matcher, renderer.device)
+    index = make_index(options, renderer, poses)
+    save_index(path, index, key)
+    return path, index
+
+
+def matcher_settings(options: argparse.Namespace) -> MatcherSettings:
+    """Return the features that options of `add_index_options` name."""
+    return MatcherSettings(options.matcher, options.weights)
+
+
+def training_poses(options: argparse.Namespace, placed: Similarity) -> np.ndarray | None:
+    """Return the poses (N, 4, 4) T_map_camera that options of `add_index_options` name; None where they name none.
+
+    Args:
+        options: the scene's poses are in the frame of the map's file.
+        placed: where that lies in the map frame.
+    """
+    if not options.poses:
+        return None
+    return np.array([placed.transform_pose(pose) for pose in load_poses(options.poses)])
+
+
+def make_index(options: argparse.Namespace, renderer: Renderer, poses: np.ndarray | None) -> ViewIndex:
+    """Make the index that options of `add_index_options` ask for, of a renderer's map, and show how far it is."""
+    features = load_matcher(matcher_settings(options), renderer.device)
     with tqdm(desc="views", unit="view", disable=None) as bar:
 
         def progress(done: int, total: int) -> None:
@@ -68,9 +91,7 @@ def _make(options: argparse.Namespace) -> tuple[Path, ViewIndex]:
             bar.update(done - bar.n)
 
         settings = IndexOptions(views=options.views, seed=options.seed)
-        index = build_index(renderer, features, settings, progress, poses=poses)
-    save_index(path, index, key)
-    return path, index
+        return build_index(renderer, features, settings, progress, poses=poses)
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -78,8 +99,16 @@ def make_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="gsfeatloc index", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    index, matcher = IndexOptions(), MatcherSettings()
     parser.add_argument("map", type=Path, metavar="MAP", help="the Gaussian Splatting map")
+    add_index_options(parser)
+    parser.add_argument("--out", type=Path, metavar="FILE", help="the index (default: where the node looks for it)")
+    add_map_options(parser)
+    return parser
+
+
+def add_index_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of how an index is made, for `make_index`."""
+    index, matcher = IndexOptions(), MatcherSettings()
     parser.add_argument(
         "--poses",
         type=Path,
@@ -97,9 +126,6 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument("--weights", default="", metavar="PATH", help="of a learned matcher, as matcher.weights")
     parser.add_argument("--device", choices=DEVICES, default="auto", help="to render on (default: %(default)s)")
     parser.add_argument("--threads", type=number(int, 0), default=0, help="CPU threads; 0 for one per core")
-    parser.add_argument("--out", type=Path, metavar="FILE", help="the index (default: where the node looks for it)")
-    add_map_options(parser)
-    return parser
 
 
 if __name__ == "__main__":

@@ -138,7 +138,7 @@ def _settings(options: argparse.Namespace) -> Settings:
     }
     values |= {name: value for name, value in own.items() if value is not None}
     values |= {f"localizer.{name}": value for name, value in options.set.items()}
-    settings = Settings.checked(values, _say)
+    settings = Settings.checked(values, _say).resolved()
     for name in _WITHOUT_EFFECT:
         if name in values:
             _say(f"parameter {name} has no effect here")

@@ -28,6 +28,7 @@ COMMAND_LINES = {
         "MAP --pose 0 0 0 0 0 0 1 --camera BAD --out OUT",
     ],
     "index": ["BAD", "MAP --poses BAD"],
+    "prepare": ["BAD --out OUT", "MAP --out OUT --align BAD", "MAP --out OUT --poses BAD"],
     "align": [
         "trajectory --answers BAD --trajectory BAD --out OUT",
         "drive BAD --map MAP --image /i --camera-info /c --out OUT",
