@@ -38,6 +38,14 @@ class MapSettings:
         "", "Path of nerfstudio's dataparser_transforms.json, undone before the three above; empty for none."
     )
     reading: ReadOptions = field(default_factory=ReadOptions)
+    cloud_points: int = parameter(
+        100_000, "Most points of ~/map, the Gaussians of most opacity times size; 0 for no such topic.", (0, 5_000_000)
+    )
+    occupancy_resolution: float = parameter(0.05, "Map units of a cell of ~/occupancy.", (1e-3, 10.0))
+    occupancy_min_height: float = parameter(
+        0.1, "Height above z = 0 in map units from which ~/occupancy holds what is in a robot's way.", (-100.0, 100.0)
+    )
+    occupancy_max_height: float = parameter(1.0, "Height up to which it does.", (-100.0, 100.0))
     cache: bool = parameter(
         True, "Keep the map, prepared for rendering, in a file beside it (*.gsfeatloc-cache): later starts are faster."
     )

@@ -14,6 +14,7 @@ from gsfeatloc_ros.node.attempts import Attempts, Outputs
 from gsfeatloc_ros.node.diagnostics import OK, Reporter
 from gsfeatloc_ros.node.graph import GraphWatch
 from gsfeatloc_ros.node.index_build import IndexBuild
+from gsfeatloc_ros.node.map_view import MapView
 from gsfeatloc_ros.node.pose_file import PoseFile
 from gsfeatloc_ros.node.publishers import Publishers
 from gsfeatloc_ros.node.reception import Reception
@@ -89,6 +90,7 @@ class Session:
         self._standing = StandingPublisher(node, state, reporter, withheld)
         self._pose_file = PoseFile(settings.state.path, settings.map, reporter)
         self._use_saved_pose()
+        self._map_view = MapView(node, settings.map, reporter)
         outputs = Outputs(self._publishers, self._standing, self._pose_file, self.report)
         self.attempts = Attempts(engine, self._follower, outputs)
         self.reception = Reception(node, settings, inputs, self.report, self.attempts.offer)
@@ -148,6 +150,7 @@ class Session:
         for timer in self._timers:
             self._node.destroy_timer(timer)
         self._standing.close()
+        self._map_view.close()
         self._publishers.close()
 
     def lose(self, reason: str) -> None:
@@ -166,6 +169,7 @@ class Session:
         self._publishers.forget()
         self._standing.publish()
         self._pose_file.use_map(self.settings.map)
+        self._map_view.use_map(self.settings.map)
         self._tell_reading()
         self._index_build.start(self.settings)
 
@@ -207,6 +211,7 @@ class Session:
         if self.active:
             self._follower.pass_time(mode == CONTINUOUS)
             self._standing.publish()
+            self._map_view.look()
         level, reason, missing = OK, "inactive", ""
         if self.active:
             missing = self._graph.look(self.reception.unheard, mode)
