@@ -27,7 +27,7 @@ _MIRRORED = 1e-4
 # the photo may be covered or changed, less without a prior, and least where the prior says something else.
 _MAX_CHANGED = 0.7
 _MAX_CHANGED_WITHOUT_PRIOR = 0.4
-_MAX_CHANGED_FAR_FROM_PRIOR = 0.2
+_MAX_CHANGED_FAR_FROM_PRIOR = 0.15
 # What covers the photo is seldom found in the render. By a wrong calibration a part of the photo fits, and the rest is
 # found beside where it should be: at least this share of the corners that are found agree.
 _MIN_INLIER_RATIO = 0.8
