@@ -21,7 +21,10 @@ from gsfeatloc_ros.evaluate.protocol import PhotoPrior
 from gsfeatloc_ros.evaluate.run import Run
 
 # Rooms of the package that no result depends on.
-_NOT_MEASURED = ("benchmark", "client", "node", "replay", "ros_io", "simulate", "tools", "evaluate/report")
+_NOT_MEASURED = (
+    *("align", "benchmark", "client", "crosscheck", "inspect", "node", "replay", "ros_io", "simulate", "tools"),
+    "evaluate/report",
+)
 
 
 @dataclass(frozen=True)

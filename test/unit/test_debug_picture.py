@@ -181,8 +181,8 @@ def test_every_number_of_the_evidence_is_drawn():
         other = replace(estimate, evidence=replace(evidence, **{name: 3}))
         assert (draw(replace(trace, estimate=other))[480:] != band).any(), name
     other = replace(estimate, covariance=100 * estimate.covariance)
-    # The protection level is in the second row.
-    rows = slice(480 + 52, 480 + 52 + 2 * 42)
+    # The protection level is among the evidence, above the standard deviations.
+    rows = slice(480 + 52, 480 + 52 + 3 * 42)
     assert (draw(replace(trace, estimate=other))[rows] != draw(replace(trace, estimate=estimate))[rows]).any()
 
 
