@@ -36,7 +36,7 @@ def node(room_map_file):
     node = LocalizerNode()
     assert node.trigger_configure() == TransitionCallbackReturn.SUCCESS
     engine = node.session.engine
-    node.session.use_map(replace(engine, renderer=OutOfMemory(engine.renderer)))
+    node.session.use_map(replace(engine, renderer=OutOfMemory(engine.renderer)), node.session.settings.map)
     node.trigger_activate()
     spinning = threading.Thread(target=rclpy.spin, args=(node,))
     spinning.start()
