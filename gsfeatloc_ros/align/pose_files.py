@@ -14,8 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from gsfeatloc_ros.align.pairs import Answer
-from gsfeatloc_ros.common.geometry import make_pose, matrix_from_quaternion
+from gsfeatloc_ros.common.geometry import pose_from_numbers
 from gsfeatloc_ros.common.safe_files import open_regular
+from gsfeatloc_ros.common.tum import tum_fields
 
 # Hours of odometry at 200 Hz.
 _MAX_BYTES = 500_000_000
@@ -70,10 +71,8 @@ def _lines(path: Path) -> list[str]:
 
 
 def _tum(path: Path, lines: Sequence[str]) -> Iterator[tuple[int, np.ndarray]]:
-    for number, line in enumerate(lines, start=1):
-        fields = line.partition("#")[0].replace(",", " ").split()
-        if fields:
-            yield _stamped(path, number, fields)
+    for number, fields in tum_fields(lines):
+        yield _stamped(path, number, fields)
 
 
 def _answer(path: Path, number: int, row: dict[str, str | None]) -> Answer:
@@ -91,10 +90,9 @@ def _stamped(path: Path, number: int, fields: Sequence[str]) -> tuple[int, np.nd
     """Return stamp and pose of a line's fields."""
     try:
         stamp = Decimal(fields[0]) * 10**9
-        values = np.array([float(value) for value in fields[1:]])
-        if values.shape != (7,) or not np.isfinite(values).all() or not abs(stamp) < _MAX_STAMP:
+        if not abs(stamp) < _MAX_STAMP:
             raise ValueError
-        return round(stamp), make_pose(matrix_from_quaternion(values[3:]), values[:3])
+        return round(stamp), pose_from_numbers([float(value) for value in fields[1:]])
     except (ValueError, InvalidOperation) as error:
         text = " ".join(fields)[:120]
         raise ValueError(f"{path}: line {number} is not `stamp x y z qx qy qz qw`: {text}") from error

@@ -25,7 +25,7 @@ from gsfeatloc_ros.align.robot_path import RobotPath
 from gsfeatloc_ros.align.target import Checkerboard, Tags, Target
 from gsfeatloc_ros.align.target_fit import fit_targets, scale_by_targets
 from gsfeatloc_ros.align.views import views_of_bag, views_of_scene
-from gsfeatloc_ros.common.geometry import make_pose, matrix_from_quaternion
+from gsfeatloc_ros.common.geometry import pose_from_numbers
 from gsfeatloc_ros.common.parameter import values_of
 from gsfeatloc_ros.localize.engine import load_renderer
 from gsfeatloc_ros.localize.settings import MapSettings, MatcherSettings, RendererSettings
@@ -161,6 +161,6 @@ def _pose(option: str, values: Sequence[float] | None) -> np.ndarray | None:
     if values is None:
         return None
     try:
-        return make_pose(matrix_from_quaternion(values[3:]), values[:3])
+        return pose_from_numbers(values)
     except ValueError as error:
         raise ValueError(f"{option}: {error}") from error

@@ -151,7 +151,7 @@ def pinhole(size: Size) -> Camera:
     """Return a camera of width and height `size` with a usual field of view."""
     width, height = size
     focal = 0.5 * width / np.tan(np.radians(0.5 * _FIELD_OF_VIEW))
-    return Camera(width, height, np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1.0]]))
+    return Camera.centred(width, height, focal)
 
 
 def view_of_all(gaussian_map: GaussianMap) -> np.ndarray:

@@ -59,6 +59,12 @@ class Camera:
         if len(self.distortion) not in counts:
             raise ValueError(f"distortion model {self.model} takes {counts} coefficients, got {len(self.distortion)}")
 
+    @classmethod
+    def centred(cls, width: int, height: int, focal_length: float) -> Camera:
+        """Return a camera without distortion that looks along the middle of its image; focal length in pixels."""
+        K = np.array([[focal_length, 0, (width - 1) / 2], [0, focal_length, (height - 1) / 2], [0, 0, 1]])
+        return cls(width, height, K)
+
     @property
     def fov_x(self) -> float:
         """Horizontal field of view of the undistorted image, in radians."""

@@ -101,6 +101,23 @@ def quaternion_from_matrix(rotation: np.ndarray) -> np.ndarray:
     return -q if q[3] < 0 else q
 
 
+def pose_from_numbers(numbers: ArrayLike) -> np.ndarray:
+    """Return the pose (4, 4) of seven numbers: x y z and a quaternion qx qy qz qw of any positive norm.
+
+    Raises:
+        ValueError: they are not seven finite numbers, or the quaternion is (nearly) zero.
+    """
+    values = np.asarray(numbers, dtype=np.float64)
+    if values.shape != (7,) or not np.isfinite(values).all():
+        raise ValueError(f"{values.tolist()} is no pose: seven finite numbers x y z qx qy qz qw")
+    return make_pose(matrix_from_quaternion(values[3:]), values[:3])
+
+
+def moved(pose: np.ndarray, step: np.ndarray) -> np.ndarray:
+    """Return a pose (4, 4) after a step (6,): moved by the first three, turned on the left by a rotation vector."""
+    return make_pose(so3_exp(step[3:]) @ pose[:3, :3], pose[:3, 3] + step[:3])
+
+
 def interpolate(pose_a: np.ndarray, pose_b: np.ndarray, fraction: float) -> np.ndarray:
     """Return the pose (4, 4) at a fraction of the way from one to another: straight, turning evenly about one axis."""
     turn = so3_log(pose_a[:3, :3].T @ pose_b[:3, :3])

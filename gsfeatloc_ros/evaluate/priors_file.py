@@ -18,7 +18,8 @@ from pathlib import Path
 
 import numpy as np
 
-from gsfeatloc_ros.common.geometry import make_pose, matrix_from_quaternion
+from gsfeatloc_ros.common.geometry import pose_from_numbers
+from gsfeatloc_ros.common.tum import tum_fields
 from gsfeatloc_ros.evaluate.dataset import Scene
 from gsfeatloc_ros.evaluate.protocol import PhotoPrior
 
@@ -63,10 +64,8 @@ def _text(data: bytes) -> str:
 
 def _tum_lines(lines: Sequence[str]) -> Iterator[tuple[int, str, list[str]]]:
     """Yield number, name and the seven values of each line."""
-    for number, line in enumerate(lines, start=1):
-        fields = line.partition("#")[0].replace(",", " ").split()
-        if fields:
-            yield number, fields[0], fields[1:]
+    for number, (name, *values) in tum_fields(lines):
+        yield number, name, values
 
 
 def _csv_lines(lines: Sequence[str]) -> Iterator[tuple[int, str, list[str]]]:
@@ -89,9 +88,6 @@ def _csv_lines(lines: Sequence[str]) -> Iterator[tuple[int, str, list[str]]]:
 def _pose(number: int, values: list[str]) -> np.ndarray:
     """Return T_map_camera (4, 4) from the fields of a line."""
     try:
-        translation, quaternion = np.split(np.array([float(value) for value in values]), [3])
-        if quaternion.shape != (4,) or not np.isfinite(translation).all():
-            raise ValueError
-        return make_pose(matrix_from_quaternion(quaternion), translation)
+        return pose_from_numbers([float(value) for value in values])
     except (TypeError, ValueError) as error:
         raise ValueError(f"line {number} does not hold a pose, {' '.join(_NUMBERS)}: {values}") from error

@@ -8,12 +8,11 @@ from dataclasses import replace
 import numpy as np
 
 from gsfeatloc_ros.common.arrays import to_host
-from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.stage_clock import Interrupted
 from gsfeatloc_ros.index.landmarks import View, merge
 from gsfeatloc_ros.index.look_alikes import find_look_alikes
 from gsfeatloc_ros.index.options import IndexOptions
-from gsfeatloc_ros.index.placement import cover, overlap, radius, random_poses, seen_cells, sees
+from gsfeatloc_ros.index.placement import NEAR, SMALL_VIEW, VIEW, cover, overlap, radius, random_poses, seen_cells, sees
 from gsfeatloc_ros.index.view_index import ViewIndex
 from gsfeatloc_ros.match.base import Features, Matcher
 from gsfeatloc_ros.pose.lift import LiftOptions, lift
@@ -22,11 +21,6 @@ from gsfeatloc_ros.render.base import Renderer
 # Poses that are looked at small for each view that is wanted, and how many of them are looked at closely.
 _CANDIDATES_PER_VIEW = 10
 _SHORTLIST = 2
-# Width, height and focal length, in pixels, of small views and of views.
-_SMALL_VIEW = (80, 60, 72.0)
-_VIEW = (320, 240, 288.0)
-# Hardly anything may be nearer to a view than this share of the map's radius.
-_NEAR = 0.02
 # Most features of a view.
 _MAX_FEATURES = 225
 # A view with so many landmarks is as good as one with more; no more than so many are kept.
@@ -74,13 +68,13 @@ def build_index(
             raise Interrupted
         progress(done, total)
 
-    small, near = _camera(*_SMALL_VIEW), _NEAR * radius(points)
+    near = NEAR * radius(points)
     seen = []
     for number, pose in enumerate(candidates):
         check(number)
-        render = renderer.render(small, pose)
+        render = renderer.render(SMALL_VIEW, pose)
         free = number < len(given) or sees(render, distances[number - len(given)])
-        seen.append(seen_cells(render, small, pose, near) if free else set())
+        seen.append(seen_cells(render, SMALL_VIEW, pose, near) if free else set())
     photos = np.arange(len(candidates)) if poses is None else np.arange(len(given))
     photos = photos[:: -(-len(photos) // _MAX_PHOTOS)]
     worth = overlap([seen[photo] for photo in photos], seen)
@@ -95,22 +89,16 @@ def build_index(
     progress(total, total)
     poses_kept = np.array([views[view].pose for view in kept]).reshape(-1, 4, 4)
     index = ViewIndex.compress(poses_kept, landmarks.of_views(kept, _MAX_LANDMARKS))
-    return replace(index, look_alikes=find_look_alikes(index, _camera(*_VIEW)))
-
-
-def _camera(width: int, height: int, focal_length: float) -> Camera:
-    K = np.array([[focal_length, 0, (width - 1) / 2], [0, focal_length, (height - 1) / 2], [0, 0, 1]])
-    return Camera(width, height, K)
+    return replace(index, look_alikes=find_look_alikes(index, VIEW))
 
 
 def _look(renderer: Renderer, matcher: Matcher, pose: np.ndarray) -> View:
     """Find and lift the features of the view at a pose (4, 4); raise ValueError where they have no descriptors."""
-    camera = _camera(*_VIEW)
-    render = renderer.render(camera, pose)
+    render = renderer.render(VIEW, pose)
     features = matcher.features(render.device_image())
     if not isinstance(features, Features):
         raise ValueError("the matcher has no descriptors by which views could be found: use sift, xfeat or another")
     strongest = np.argsort(-to_host(features.scores))[:_MAX_FEATURES]
-    lifted = lift(render, camera, pose, to_host(features.keypoints)[strongest].astype(np.float64), LiftOptions())
+    lifted = lift(render, VIEW, pose, to_host(features.keypoints)[strongest].astype(np.float64), LiftOptions())
     descriptors = to_host(features.descriptors)[strongest][lifted.valid]
     return View(pose, descriptors.astype(np.float32), lifted.points[lifted.valid])

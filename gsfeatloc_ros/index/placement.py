@@ -13,6 +13,10 @@ from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.geometry import make_pose
 from gsfeatloc_ros.render.base import Render
 
+# Cameras of views, and of those that are looked at small; hardly anything may be nearer to one than this share of the
+# map's radius.
+VIEW, SMALL_VIEW = Camera.centred(320, 240, 288.0), Camera.centred(80, 60, 72.0)
+NEAR = 0.02
 # Positions are drawn from the box of the solid Gaussians, but for a share of outliers at each end, grown by so much,
 # and from these distances from them, in radii of the box.
 _OUTLIERS = 1.0  # per cent

@@ -9,7 +9,8 @@ import cv2
 import numpy as np
 
 from gsfeatloc_ros.common.arrays import to_host
-from gsfeatloc_ros.inspect.looks import LOOK, Look, pinhole
+from gsfeatloc_ros.index.placement import SMALL_VIEW
+from gsfeatloc_ros.inspect.looks import Look
 from gsfeatloc_ros.localize.settings import RendererSettings
 from gsfeatloc_ros.maps import GaussianMap
 from gsfeatloc_ros.render import create_renderer
@@ -56,7 +57,7 @@ def find_floaters(map_: GaussianMap, looks: Sequence[Look], settings: RendererSe
     """
     renderer = create_renderer(replace(map_, antialiased=True), settings.device, settings.threads)
     drawn = [
-        replace(look, render=renderer.render(pinhole(*LOOK), look.pose).on_host())
+        replace(look, render=renderer.render(SMALL_VIEW, look.pose).on_host())
         for look in looks[:: max(1, len(looks) // _MAX_LOOKS)]
     ]
     step = -(-len(map_) // _MAX_GAUSSIANS)
@@ -70,7 +71,7 @@ def find_floaters(map_: GaussianMap, looks: Sequence[Look], settings: RendererSe
 
 def floating(points: np.ndarray, looks: Sequence[Look]) -> np.ndarray:
     """Return whether points (N, 3) of the map frame hang in free space: (N,) bool."""
-    camera = pinhole(*LOOK)
+    size = [SMALL_VIEW.width, SMALL_VIEW.height]
     seen, free = np.zeros(len(points), np.int32), np.zeros(len(points), np.int32)
     for look in looks:
         depth = np.nan_to_num(to_host(look.render.median_depth), nan=_NOTHING)
@@ -78,8 +79,8 @@ def floating(points: np.ndarray, looks: Sequence[Look]) -> np.ndarray:
         local = (points - look.pose[:3, 3]) @ look.pose[:3, :3]
         z = local[:, 2]
         with np.errstate(divide="ignore", invalid="ignore"):
-            pixels = np.rint(camera.project(local))
-            ahead = (z > _NEAR) & (pixels >= 0).all(axis=1) & (pixels < [camera.width, camera.height]).all(axis=1)
+            pixels = np.rint(SMALL_VIEW.project(local))
+            ahead = (z > _NEAR) & (pixels >= 0).all(axis=1) & (pixels < size).all(axis=1)
         column, row = pixels[ahead].astype(np.intp).T
         seen[ahead] += z[ahead] < _SEEN * np.maximum(depth, behind)[row, column]
         free[ahead] += z[ahead] < _IN_FRONT * behind[row, column]

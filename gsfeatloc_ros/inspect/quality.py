@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsfeatloc_ros.inspect.looks import Look, pinhole
+from gsfeatloc_ros.index.placement import VIEW
+from gsfeatloc_ros.inspect.looks import Look
 from gsfeatloc_ros.match import DEFAULT_MAX_FEATURES, create_matcher
 from gsfeatloc_ros.pose.lift import LiftOptions, lift
 from gsfeatloc_ros.render.base import DEPTH_MIN_ALPHA, Renderer
 
-# Width, height and focal length, in pixels, of views, as of the index of views. Pixels of a grid are lifted.
-VIEW = (320, 240, 288.0)
+# Pixels so far apart, across and down, are lifted.
 _GRID = 8
 # Covered less than this, a pixel shows the background.
 _BACKGROUND = 0.02
@@ -38,14 +38,14 @@ class Quality:
 
 def look_closely(renderer: Renderer, looks: Sequence[Look]) -> tuple[Quality, list[np.ndarray]]:
     """Draw the views of looks large; return how good they are, and the pictures (240, 320, 3) uint8 RGB."""
-    camera, matcher = pinhole(*VIEW), create_matcher("sift", "", DEFAULT_MAX_FEATURES)
-    columns, rows = np.meshgrid(np.arange(_GRID, camera.width, _GRID), np.arange(_GRID, camera.height, _GRID))
+    matcher = create_matcher("sift", "", DEFAULT_MAX_FEATURES)
+    columns, rows = np.meshgrid(np.arange(_GRID, VIEW.width, _GRID), np.arange(_GRID, VIEW.height, _GRID))
     pixels = np.column_stack([columns.ravel(), rows.ravel()]).astype(np.float64)
     found, pictures = [], []
     for look in looks:
-        render = renderer.render(camera, look.pose).on_host()
+        render = renderer.render(VIEW, look.pose).on_host()
         pictures.append(render.image())
-        valid = lift(render, camera, look.pose, pixels, LiftOptions()).valid
+        valid = lift(render, VIEW, look.pose, pixels, LiftOptions()).valid
         alpha = render.alpha[rows.ravel(), columns.ravel()]
         shown = alpha > _BACKGROUND
         shares = (valid[shown].mean(), (alpha[shown] < DEPTH_MIN_ALPHA).mean()) if shown.any() else (0.0, 1.0)

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsfeatloc_ros.common.arrays import to_host
-from gsfeatloc_ros.inspect.looks import LOOK, Look, pinhole
+from gsfeatloc_ros.index.placement import SMALL_VIEW
+from gsfeatloc_ros.inspect.looks import Look
 
 # A pixel shows a surface where it is covered so far, its depths spread over no more than this share of the depth, its
 # neighbours are no farther in front of or behind each other, and it is not seen at a grazing angle (cosine).
@@ -49,7 +50,7 @@ def find_surfaces(looks: Sequence[Look], radius: float) -> Surfaces:
 
 def _shown(look: Look) -> tuple[np.ndarray, np.ndarray]:
     """Return the points (n, 3) and unit normals (n, 3) of a look's pixels."""
-    camera, depth = pinhole(*LOOK), to_host(look.render.median_depth).astype(np.float64)
+    camera, depth = SMALL_VIEW, to_host(look.render.median_depth).astype(np.float64)
     columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
     rays = camera.rays(np.column_stack([columns.ravel(), rows.ravel()]).astype(np.float64))
     points = rays.reshape(camera.height, camera.width, 3) * depth[..., None]

@@ -10,7 +10,7 @@ from itertools import islice
 import numpy as np
 
 from gsfeatloc_ros.common.camera import Camera
-from gsfeatloc_ros.common.geometry import invert, make_pose, so3_exp, transform
+from gsfeatloc_ros.common.geometry import invert, moved, transform
 from gsfeatloc_ros.index.look_alikes import poses_elsewhere
 from gsfeatloc_ros.localize.evidence import Evidence
 from gsfeatloc_ros.localize.prior import Prior
@@ -274,4 +274,4 @@ def spread_poses(
     for step in (root @ point for point in chosen):
         if np.linalg.norm((step - steps) / min_step, axis=1).min() >= 1:
             steps = np.vstack([steps, step])
-    return [make_pose(so3_exp(step[3:]) @ T_map_camera[:3, :3], T_map_camera[:3, 3] + step[:3]) for step in steps[1:]]
+    return [moved(T_map_camera, step) for step in steps[1:]]

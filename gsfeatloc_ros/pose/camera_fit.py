@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsfeatloc_ros.common.camera import Camera
-from gsfeatloc_ros.common.geometry import make_pose, skew, so3_exp
+from gsfeatloc_ros.common.geometry import moved, skew
 from gsfeatloc_ros.pose.solve import Correspondences, PoseOptions, shared_variance, whiten
 
 # Parameters beside the pose: focal length (relative), k1, and by how much the camera turns, in radians about its axes,
@@ -89,14 +89,15 @@ def fit_camera(
 
 
 def _fit(camera: Camera, calibrated: _State, found: Correspondences, options: PoseOptions) -> CameraFit:
-    free = _Problem.at(calibrated, camera, found, options).solve(calibrated, _ANY_CAMERA)
+    free = _Problem.seen_from(calibrated, camera, found, options).solve(calibrated, _ANY_CAMERA)
     # The keypoints' noise is what is left once the camera's errors are explained.
-    problem = _Problem.at(free, camera, found, options)
-    sigmas = np.sqrt(np.maximum(np.diag(problem.covariance(free, _ANY_CAMERA))[6:], 0.0))
+    problem = _Problem.seen_from(free, camera, found, options)
+    sigmas = np.sqrt(np.maximum(np.diag(problem.covariance(problem.at(free), _ANY_CAMERA))[6:], 0.0))
     excess = np.sqrt(np.maximum(free.camera**2 - sigmas**2, 0.0))
     kept = problem.solve(free, np.clip(np.where(_CONTRADICTED, excess, 0.0), _EXACT, _ANY_CAMERA))
     # What a calibration in use would move the pose by is not known better than that.
-    shift = problem.step(kept, _CALIBRATED)[:6]
+    system = problem.at(kept)
+    shift = system.step(_CALIBRATED)[:6]
     return CameraFit(
         focal=float(free.camera[0]),
         focal_sigma=float(sigmas[0]),
@@ -105,7 +106,7 @@ def _fit(camera: Camera, calibrated: _State, found: Correspondences, options: Po
         rolling=free.camera[2:],
         rolling_sigma=sigmas[2:],
         T_map_camera=kept.pose,
-        covariance=problem.covariance(kept, _CALIBRATED)[:6, :6] + np.outer(shift, shift),
+        covariance=problem.covariance(system, _CALIBRATED)[:6, :6] + np.outer(shift, shift),
         followed=kept.camera,
     )
 
@@ -123,14 +124,17 @@ class _State:
 
     def moved(self, step: np.ndarray) -> _State:
         """Return the state after a step (11,)."""
-        rotation, translation = self.pose[:3, :3], self.pose[:3, 3]
-        return _State(make_pose(so3_exp(step[3:6]) @ rotation, translation + step[:3]), self.camera + step[6:])
+        return _State(moved(self.pose, step[:6]), self.camera + step[6:])
 
 
 @dataclass(frozen=True, eq=False)
 class _System:
-    """The robust least squares problem at a state: residuals (M, 2), Jacobians (M, 2, 11), and what follows."""
+    """The robust least squares problem at a state: residuals (M, 2), Jacobians (M, 2, 11), and what follows.
 
+    Deviations (5,) are standard deviations of the camera's parameters before the photo is seen.
+    """
+
+    state: _State
     residuals: np.ndarray
     jacobian: np.ndarray
     squared: np.ndarray
@@ -138,13 +142,16 @@ class _System:
     hessian: np.ndarray
     gradient: np.ndarray
 
+    def step(self, deviations: np.ndarray) -> np.ndarray:
+        """Return the step (11,) to the most likely state of the linearized problem."""
+        information = _information(deviations)
+        known = information * np.concatenate([np.zeros(6), self.state.camera])
+        return -np.linalg.solve(self.hessian + np.diag(information), self.gradient + known)
+
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """Matches to be explained by a pose and a camera that is about as calibrated.
-
-    Deviations (5,) are standard deviations of the camera's parameters before the photo is seen.
-    """
+    """Matches to be explained by a pose and a camera that is about as calibrated; deviations as of a _System."""
 
     calibrated: Camera
     found: Correspondences
@@ -152,7 +159,7 @@ class _Problem:
     options: PoseOptions
 
     @classmethod
-    def at(cls, state: _State, camera: Camera, found: Correspondences, options: PoseOptions) -> _Problem:
+    def seen_from(cls, state: _State, camera: Camera, found: Correspondences, options: PoseOptions) -> _Problem:
         """Return the problem with the keypoints' noise as measured at a state."""
         residuals, _ = _linearize(camera, state.pose, state.camera, found)
         whitening = whiten(camera, state.pose, found, residuals)
@@ -164,22 +171,15 @@ class _Problem:
         """Return the most likely state."""
         state = start
         for _ in range(_MAX_ITERATIONS):
-            step = self.step(state, deviations)
+            step = self.at(state).step(deviations)
             state = state.moved(step)
             if np.abs(step[6:] / _ANY_CAMERA).max() < _MIN_STEP:
                 break
         return state
 
-    def step(self, state: _State, deviations: np.ndarray) -> np.ndarray:
-        """Return the step (11,) to the most likely state of the linearized problem."""
-        system, information = self._system(state), _information(deviations)
-        known = information * np.concatenate([np.zeros(6), state.camera])
-        return -np.linalg.solve(system.hessian + np.diag(information), system.gradient + known)
-
-    def covariance(self, state: _State, deviations: np.ndarray) -> np.ndarray:
+    def covariance(self, system: _System, deviations: np.ndarray) -> np.ndarray:
         """Return the covariance (11, 11) of pose and camera, with what the matches have in common, as of a pose."""
-        system, known = self._system(state), np.diag(_information(deviations))
-        weights = system.weights
+        known, weights = np.diag(_information(deviations)), system.weights
         inflation = max((weights * system.squared).sum() / max(2 * weights.sum() - len(known), 1.0), 1.0)
         weighted = (weights[:, None, None] * system.jacobian).reshape(-1, len(known))
         of_a_match = weighted.T @ system.jacobian.reshape(-1, len(known)) / weights.sum()
@@ -187,8 +187,8 @@ class _Problem:
         # What they have in common counts as one match with that error, beside what is known before.
         return inflation * np.linalg.inv(system.hessian + known) + np.linalg.inv(of_a_match / shared + known)
 
-    def _system(self, state: _State) -> _System:
-        """Return the whitened problem with Cauchy's weights (iteratively reweighted least squares)."""
+    def at(self, state: _State) -> _System:
+        """Return the whitened problem at a state with Cauchy's weights (iteratively reweighted least squares)."""
         residuals, jacobian = _linearize(self.calibrated, state.pose, state.camera, self.found)
         white = np.einsum("mij,mj->mi", self.whitening, residuals)
         white_jacobian = self.whitening @ jacobian
@@ -197,7 +197,7 @@ class _Problem:
         size = jacobian.shape[2]
         weighted = (weights[:, None, None] * white_jacobian).reshape(-1, size)
         hessian = weighted.T @ white_jacobian.reshape(-1, size)
-        return _System(residuals, jacobian, squared, weights, hessian, weighted.T @ white.ravel())
+        return _System(state, residuals, jacobian, squared, weights, hessian, weighted.T @ white.ravel())
 
 
 def _information(deviations: np.ndarray) -> np.ndarray:

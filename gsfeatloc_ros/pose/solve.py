@@ -13,7 +13,7 @@ import numpy as np
 import poselib
 
 from gsfeatloc_ros.common.camera import Camera
-from gsfeatloc_ros.common.geometry import invert, make_pose, skew, so3_exp
+from gsfeatloc_ros.common.geometry import invert, make_pose, moved, skew
 from gsfeatloc_ros.common.parameter import parameter
 
 _MIN_ITERATIONS, _MAX_ITERATIONS = 200, 10_000
@@ -218,7 +218,7 @@ def refine_pose(
             step = np.linalg.solve(hessian + damping * np.diag(np.diag(hessian)), -gradient)
         except np.linalg.LinAlgError:
             return None
-        candidate = make_pose(so3_exp(step[3:]) @ pose[:3, :3], pose[:3, 3] + step[:3])
+        candidate = moved(pose, step)
         linear_there = _linearize(camera, candidate, found)
         if linear_there is None or (cost_there := cost(linear_there.residuals)) > current:
             damping *= 10

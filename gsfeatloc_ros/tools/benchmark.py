@@ -21,8 +21,6 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from gsfeatloc_ros.benchmark import index_scaling
 from gsfeatloc_ros.benchmark.frames import measure_map, measure_scene, pinhole, print_frames, view_of_all
 from gsfeatloc_ros.benchmark.measure import machine
@@ -30,7 +28,7 @@ from gsfeatloc_ros.benchmark.pnp import measure_pnp
 from gsfeatloc_ros.benchmark.query import measure_queries, print_queries
 from gsfeatloc_ros.benchmark.scaling import COUNTS, draw_scaling, measure_scaling
 from gsfeatloc_ros.benchmark.twins import measure_twins, twins_table
-from gsfeatloc_ros.common.geometry import make_pose, matrix_from_quaternion, quaternion_from_matrix
+from gsfeatloc_ros.common.geometry import pose_from_numbers, quaternion_from_matrix
 from gsfeatloc_ros.evaluate.scene import load_scene
 from gsfeatloc_ros.localize.settings import RendererSettings
 from gsfeatloc_ros.maps import load_map
@@ -156,7 +154,7 @@ def _render(options: argparse.Namespace) -> None:
     if options.scene:
         report = measure_scene(options.scene, options.size, settings)
     else:
-        pose = _pose(options.pose) if options.pose else None
+        pose = pose_from_numbers(options.pose) if options.pose else None
         report = measure_map(options.map, options.size, pose, options.frames, settings)
     print_frames(report)
     _write(options.json, report | {"device": options.device, "threads": options.threads})
@@ -173,7 +171,7 @@ def _opensplat(options: argparse.Namespace) -> None:
         poses = [photo.T_map_camera for photo in scene.photos]
     else:
         gaussian_map, camera = load_map(options.map), pinhole(options.size)
-        poses = [_pose(options.pose) if options.pose else view_of_all(gaussian_map)] * options.frames
+        poses = [pose_from_numbers(options.pose) if options.pose else view_of_all(gaussian_map)] * options.frames
     report = measure_against_opensplat(options.checkout, gaussian_map, camera, poses, options.threads)
     print_against_opensplat(report)
     _write(options.json, report)
@@ -232,10 +230,6 @@ def _twins(options: argparse.Namespace) -> None:
 def _write(path: Path | None, report: dict[str, Any]) -> None:
     if path:
         path.write_text(json.dumps({"machine": machine()} | report, indent=1) + "\n")
-
-
-def _pose(numbers: list[float]) -> np.ndarray:
-    return make_pose(matrix_from_quaternion(np.array(numbers[3:])), np.array(numbers[:3]))
 
 
 def _shares(text: str) -> list[float]:

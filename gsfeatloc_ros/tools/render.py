@@ -19,12 +19,11 @@ from collections.abc import Sequence
 from contextlib import nullcontext
 from pathlib import Path
 
-import numpy as np
 from tqdm import tqdm
 
 from gsfeatloc_ros.align.pose_files import read_tum
 from gsfeatloc_ros.common.camera import Camera
-from gsfeatloc_ros.common.geometry import make_pose, matrix_from_quaternion
+from gsfeatloc_ros.common.geometry import pose_from_numbers
 from gsfeatloc_ros.localize.engine import load_renderer
 from gsfeatloc_ros.localize.settings import RendererSettings
 from gsfeatloc_ros.render import DEVICES
@@ -60,7 +59,7 @@ def _render(options: argparse.Namespace) -> int:
         if not path.absolute().parent.is_dir():
             raise ValueError(f"{path}: there is no folder {path.absolute().parent}")
     camera = _camera(options)
-    poses = [pose for _, pose in read_tum(options.path)] if options.path else [_pose(options.pose)]
+    poses = [pose for _, pose in read_tum(options.path)] if options.path else [pose_from_numbers(options.pose[-7:])]
     renderer = load_renderer(map_settings(options), RendererSettings(options.device, options.threads))
     print_reading("render", renderer)
     size = (camera.width, camera.height)
@@ -86,14 +85,7 @@ def _camera(options: argparse.Namespace) -> Camera:
         return camera.scaled(*options.size) if options.size else camera
     width, height = options.size
     focal_length = 0.5 * width / math.tan(math.radians(0.5 * options.fov))
-    K = np.array([[focal_length, 0, (width - 1) / 2], [0, focal_length, (height - 1) / 2], [0, 0, 1]])
-    return Camera(width, height, K)
-
-
-def _pose(numbers: Sequence[float]) -> np.ndarray:
-    """Return T_map_camera (4, 4) of seven numbers, or of eight of which the first is a stamp."""
-    *position, qx, qy, qz, qw = numbers[-7:]
-    return make_pose(matrix_from_quaternion(np.array([qx, qy, qz, qw])), position)
+    return Camera.centred(width, height, focal_length)
 
 
 def make_parser() -> argparse.ArgumentParser:

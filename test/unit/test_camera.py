@@ -200,3 +200,10 @@ def test_enlarging_keeps_both_sides_within_bounds(width: int, height: int) -> No
     assert larger.width >= width
     assert larger.height >= height
     assert larger.K[0, 0] <= 500.5
+
+
+def test_a_centred_camera_looks_along_the_middle_of_its_image() -> None:
+    camera = Camera.centred(320, 240, 288.0)
+    np.testing.assert_allclose(camera.project(np.array([[0.0, 0.0, 2.0]])), [[159.5, 119.5]])
+    assert camera.fov_x == pytest.approx(2 * np.arctan(160 / 288))
+    assert not camera.distorted

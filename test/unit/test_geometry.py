@@ -10,6 +10,8 @@ from gsfeatloc_ros.common.geometry import (
     invert,
     make_pose,
     matrix_from_quaternion,
+    moved,
+    pose_from_numbers,
     quaternion_from_matrix,
     random_unit_vector,
     rotation_error_deg,
@@ -153,3 +155,25 @@ def test_random_unit_vectors_are_uniform():
     # Archimedes: each coordinate of a uniform direction is uniform in [-1, 1], of mean 0 and variance 1/3.
     np.testing.assert_allclose(directions.mean(axis=0), 0, atol=4 * np.sqrt(1 / 3 / 5000))
     np.testing.assert_allclose(directions.T @ directions / 5000, np.eye(3) / 3, atol=0.03)
+
+
+@given(poses, arrays(np.float64, 6, elements=st.floats(-3, 3)))
+def test_a_step_moves_in_the_frame_and_turns_on_the_left(pose, step):
+    turned = make_pose(exponential(skew(step[3:])), np.zeros(3)) @ make_pose(pose[:3, :3], np.zeros(3))
+    turned[:3, 3] = pose[:3, 3] + step[:3]
+    np.testing.assert_allclose(moved(pose, step), turned, atol=1e-9)
+
+
+@given(vectors, quaternions)
+def test_a_pose_is_seven_numbers(translation, quaternion):
+    pose = pose_from_numbers([*translation, *quaternion])
+    np.testing.assert_array_equal(pose[:3, 3], translation)
+    np.testing.assert_array_equal(pose[:3, :3], matrix_from_quaternion(quaternion))
+
+
+@pytest.mark.parametrize(
+    "numbers", [[], [0.0] * 6, [0.0] * 7, [np.nan, 0, 0, 0, 0, 0, 1], [np.inf, 0, 0, 0, 0, 0, 1], [1.0] * 8]
+)
+def test_other_numbers_are_no_pose(numbers):
+    with pytest.raises(ValueError, match=r"seven finite numbers|no direction"):
+        pose_from_numbers(numbers)
