@@ -41,7 +41,10 @@ class NodeSettings:
         live=True,
     )
     max_rate: float = parameter(
-        0.0, "Most images localized a second, by their stamps; 0 for no limit.", (0.0, 1000.0), live=True
+        0.0,
+        "Most images localized a second, by their stamps, as evenly as they come, to within 2 %; 0 for no limit.",
+        (0.0, 1000.0),
+        live=True,
     )
     autostart: bool = parameter(True, "Load the map and start at once; false waits for a lifecycle manager.")
     track: bool = parameter(
