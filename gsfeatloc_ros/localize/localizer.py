@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from itertools import islice
@@ -14,7 +15,7 @@ import numpy as np
 from gsfeatloc_ros.common.arrays import to_host
 from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.photo import Photo
-from gsfeatloc_ros.common.stage_clock import StageClock
+from gsfeatloc_ros.common.stage_clock import OutOfTime, StageClock
 from gsfeatloc_ros.index import ViewIndex
 from gsfeatloc_ros.localize.blur import estimate_blur
 from gsfeatloc_ros.localize.comparison import changed_mask, compare, preference
@@ -105,6 +106,8 @@ class Localizer:
                 axes of the map frame, map units and radians. None for that of the options.
             interrupted: whether to give up, asked every few tens of milliseconds.
 
+        Where the options' deadline has passed before there is an answer that nothing speaks against, there is none.
+
         Raises:
             Interrupted: `interrupted` said so.
             ValueError: the image is not 8-bit RGB of the camera's size, the prior not a finite (4, 4) pose or its
@@ -127,7 +130,7 @@ class Localizer:
                 f"expected an RGB image {camera.width}x{camera.height} uint8, got shape {image.shape} {image.dtype}"
             )
         prior = Prior.of(T_map_camera_prior, prior_covariance, options)
-        clock = StageClock(self._now, interrupted)
+        clock = StageClock(self._now, interrupted, options.deadline or math.inf)
         with clock.stage("prepare"):
             photo = Photo.undistorted(image, camera, options.max_image_width)
 
@@ -140,11 +143,27 @@ class Localizer:
     def _search(self, query: Query, prior: Prior | None) -> Trace:
         """Match small views of the map, first at the prior, then where else it may be, and refine what they suggest."""
         small = query.limited(SEARCH_WIDTH)
-        reason = too_little(query, small)
-        if reason:
-            return Trace(Estimate(Status.FAILED, reason), query.photo)
         search = Search(small, prior, self._now)
-        rejected: _Candidate | None = None
+        first: _Candidate | None = None
+        try:
+            reason = too_little(query, small)
+            if reason:
+                return Trace(Estimate(Status.FAILED, reason), query.photo)
+            for candidate in self._candidates(query, search, prior):
+                first = first or candidate
+                if candidate.believed:
+                    best, rivals = self._best(query, candidate, search, prior)
+                    return best.trace(query.photo, search, rivals)
+                if candidate.only_the_camera_is_wrong:
+                    return candidate.trace(query.photo, search)
+        except OutOfTime:
+            return _out_of_time(query, search, first)
+        if first is not None:
+            return first.trace(query.photo, search)
+        return _nothing_in_common(query.photo, len(small.features), search, self._components.renderer.reading)
+
+    def _candidates(self, query: Query, search: Search, prior: Prior | None) -> Iterator[_Candidate]:
+        """Yield what the poses of a search lead to, judged."""
         limits = self._components.options.limits
         mirror_probability_wrong = cache(partial(self._mirror_probability_wrong, query))
         for pose in search.poses():
@@ -152,15 +171,7 @@ class Localizer:
             search.tried(candidate.view)
             if query.components.index is not None and is_uncertain(candidate.evidence, limits):
                 candidate = candidate.against_mirror(mirror_probability_wrong(), limits)
-            if candidate.believed:
-                best, rivals = self._best(query, candidate, search, prior)
-                return best.trace(query.photo, search, rivals)
-            if candidate.only_the_camera_is_wrong:
-                return candidate.trace(query.photo, search)
-            rejected = rejected or candidate
-        if rejected is not None:
-            return rejected.trace(query.photo, search)
-        return _nothing_in_common(query.photo, len(small.features), search, self._components.renderer.reading)
+            yield candidate
 
     def _best(
         self, query: Query, found: _Candidate, search: Search, prior: Prior | None
@@ -307,6 +318,17 @@ class _Candidate:
             )
         changed = partial(changed_mask, photo, view) if view.solution else None
         return Trace(estimate, photo, view.render, view.correspondences, changed)
+
+
+def _out_of_time(query: Query, search: Search, first: _Candidate | None) -> Trace:
+    """Time is up, and there is no answer: say what was looked at, and of the first pose found why it is none yet."""
+    reason = f"not found within {query.components.options.deadline:.2f} s: looked {search.looked or 'nowhere yet'}"
+    if first is None:
+        return Trace(Estimate(Status.FAILED, reason, evidence=search.counted(Evidence())), query.photo)
+    against = (*first.reasons_against, "other places that may explain the photo were not looked at")[0]
+    reason = f"{reason}; the pose found is not believed: {against}"
+    estimate = Estimate(Status.REJECTED, reason, evidence=search.counted(first.evidence))
+    return replace(first.trace(query.photo, search), estimate=estimate)
 
 
 def _nothing_in_common(photo: Photo, features: int, search: Search, reading: Reading) -> Trace:

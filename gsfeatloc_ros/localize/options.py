@@ -40,6 +40,12 @@ class LocalizerOptions:
     """
 
     max_image_width: int = parameter(640, "Wider images are resized to this many pixels first.", (64, 16384), live=True)
+    deadline: float = parameter(
+        0.0,
+        "Seconds after which a query ends with what it has, and says so; what was begun is ended. 0 for no end.",
+        (0.0, 3600.0),
+        live=True,
+    )
     max_passes: int = parameter(4, "Most renders at estimates to which an image is tracked.", (1, 20), live=True)
     max_views: int = parameter(
         32, "Most other views searched when the prior's shows nothing of the image; 0 for none.", (0, 1000), live=True

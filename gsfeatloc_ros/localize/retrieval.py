@@ -57,10 +57,10 @@ def retrieve(
     def weight(pose: np.ndarray) -> float:
         return 1.0 if likely(pose) else 1.0 / _WEIGHT_OF_PRIOR
 
-    with small.clock.stage("features"):
-        turned = [features.on_host()]
-        if small.components.matcher.upright:
-            turned += [_turned(small, turns) for turns in (1, 2, 3)]
+    turned = [features.on_host()]
+    for turns in (1, 2, 3) if small.components.matcher.upright else ():
+        with small.clock.stage("features"):
+            turned.append(_turned(small, turns))
     with small.clock.stage("search"):
         weights = np.array([weight(pose) for pose in index.poses])
         votes = np.array([index.rank(found) * weights for found in turned])

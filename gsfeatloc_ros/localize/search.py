@@ -90,7 +90,7 @@ class Search:
     @property
     def looked(self) -> str:
         """Where the photo was looked for, in words; empty for nowhere."""
-        views = [] if self._prior is None else ["at the prior"]
+        views = ["at the prior"] if self._prior is not None and self.views else []
         if self._around:
             views.append(f"in {self._around} views around it")
         if self.searched:
@@ -99,7 +99,7 @@ class Search:
 
     def counted(self, evidence: Evidence) -> Evidence:
         """Return evidence with the numbers of views."""
-        views = self.views - (self._prior is not None)
+        views = max(self.views - (self._prior is not None), 0)
         return replace(evidence, views=views, searched=self.searched, index_views=self._index_views)
 
     @property

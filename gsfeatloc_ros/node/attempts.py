@@ -43,7 +43,7 @@ class Job:
         inputs: the newest camera_info and prior when it was asked for; None for those when the work on it begins.
         shared: whether the answer is for all, on the topics, or only for the one who asks.
         kept: whether, asked for by one alone, it is gone on from all the same.
-        max_seconds: that the search may take; 0 for what the options say.
+        max_seconds: after which it ends with what it has; 0 for what the options say.
     """
 
     message: Image | CompressedImage
@@ -241,7 +241,8 @@ class Attempts:
         """Return the options for a job."""
         options = self._follower.options(options, job.message.header)
         if job.max_seconds > 0:
-            options = replace(options, search=replace(options.search, max_seconds=job.max_seconds))
+            search = replace(options.search, max_seconds=job.max_seconds)
+            options = replace(options, deadline=job.max_seconds, search=search)
         return options
 
     def _share(self, result: JobResult, query: LocalizerInput, extrinsics: Extrinsics, header: Header) -> JobResult:

@@ -194,9 +194,10 @@ def test_the_answer_to_a_request_heals_the_stream(client, room_camera, photo, fo
 
 def test_a_request_bounds_the_search(client, room_camera, photo):
     covered = SimulatedPhoto(0.0, np.ascontiguousarray(photo.image[::-1]), np.eye(4), np.eye(4))
-    request = request_of(client, room_camera, covered, max_seconds=0.2)
+    request = request_of(client, room_camera, covered, max_seconds=0.1)
     answer = client.call(LocalizeImage, "localizer/localize_image", request)
     assert answer.status != LocalizeImage.Response.LOCALIZED
+    assert answer.reason.startswith("not found within 0.10 s: looked ")
     assert answer.milliseconds < 1500
     request = request_of(client, room_camera, covered, max_seconds=-1.0)
     answer = client.call(LocalizeImage, "localizer/localize_image", request)

@@ -309,3 +309,48 @@ def test_what_covers_the_photo_does_not_count(sift_localizer, room_camera, room_
     changed = trace.changed()
     assert changed[140:340, 190:450].mean() > 2 * changed[:80].mean()
     assert 0.1 < trace.estimate.evidence.changed < 0.6
+
+
+class Ticks:
+    """A clock that is asked: each time it is a second later."""
+
+    def __init__(self) -> None:
+        self.seconds = 0.0
+
+    def __call__(self) -> float:
+        self.seconds += 1.0
+        return self.seconds
+
+
+def test_a_deadline_ends_a_query_without_a_half_believed_pose(renderer, room_camera, room_photos) -> None:
+    photo, matcher = room_photos[0], create_matcher("sift")
+
+    def localized(deadline):
+        ticks = Ticks()
+        localizer = Localizer(renderer, matcher, LocalizerOptions(deadline=deadline), now=ticks)
+        return localizer.localize(photo.image, room_camera, photo.T_map_camera_prior), ticks.seconds
+
+    answer, needed = localized(0.0)
+    assert answer.status is Status.LOCALIZED
+    for deadline in np.linspace(0.5, needed, 5):
+        estimate, taken = localized(float(deadline))
+        if deadline > needed - 2:
+            np.testing.assert_array_equal(estimate.T_map_camera, answer.T_map_camera)
+            continue
+        assert_no_answer(estimate)
+        assert estimate.status in (Status.FAILED, Status.REJECTED)
+        assert estimate.reason.startswith(f"not found within {deadline:.2f} s: looked ")
+        assert taken <= deadline + 5
+
+
+def test_a_deadline_says_what_was_looked_at(renderer, room_camera, room_photos) -> None:
+    prior = room_photos[0].T_map_camera_prior @ make_pose(so3_exp(np.array([0.0, np.pi, 0.0])), np.zeros(3))
+
+    def reason(deadline):
+        localizer = Localizer(renderer, create_matcher("sift"), LocalizerOptions(deadline=deadline), now=Ticks())
+        estimate = localizer.localize(room_photos[0].image, room_camera, prior)
+        assert_no_answer(estimate)
+        return estimate.reason
+
+    assert "looked nowhere yet" in reason(1.0)
+    assert "looked at the prior and in 8 views around it" in reason(40.0)
