@@ -15,7 +15,7 @@ import numpy as np
 
 from gsfeatloc_ros.align.pairs import Answer
 from gsfeatloc_ros.common.geometry import pose_from_numbers
-from gsfeatloc_ros.common.safe_files import open_regular
+from gsfeatloc_ros.common.safe_files import read_regular
 from gsfeatloc_ros.common.tum import tum_fields
 
 # Hours of odometry at 200 Hz.
@@ -56,15 +56,13 @@ def read_tum(path: Path) -> list[tuple[int, np.ndarray]]:
 
 def _lines(path: Path) -> list[str]:
     try:
-        with open_regular(path) as file:
-            data = file.read(_MAX_BYTES + 1)
-        if len(data) > _MAX_BYTES:
-            raise ValueError(f"{path}: is of more than {_MAX_BYTES // 10**6} megabytes")
-        lines = data.decode("utf-8-sig").splitlines()
+        lines = read_regular(path, _MAX_BYTES).decode("utf-8-sig").splitlines()
     except OSError as error:
         raise ValueError(f"{path}: cannot be read: {error.strerror or error}") from error
     except UnicodeDecodeError as error:
         raise ValueError(f"{path}: is no text") from error
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
     if not lines:
         raise ValueError(f"{path}: is empty")
     return lines

@@ -28,7 +28,11 @@ _JPEG_OTHERS = (0xC4, 0xCC, 0xDB, 0xDD, *range(0xE0, 0xF0), 0xFE)
 _PNG_START = b"\x89PNG\r\n\x1a\n"
 # Red, green, blue and alpha of 16 bits; palette, frames of chunks and of what does not compress.
 _MAX_PNG_PIXEL_BYTES, _MAX_PNG_OVERHEAD = 9, 65536
-_PNG_CHUNKS = (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND")
+# What makes the pixels, and tells how they are turned.
+_PNG_CHUNKS = (b"IHDR", b"PLTE", b"tRNS", b"eXIf", b"IDAT", b"IEND")
+# Of OpenCV: turned as EXIF says, and not.
+_COLOURS = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH
+_AS_STORED = _COLOURS | cv2.IMREAD_IGNORE_ORIENTATION
 # What else images are sent as, by place and bytes.
 _OTHER_KINDS = (
     (8, b"WEBP", "WebP"),
@@ -97,14 +101,34 @@ def decode(picture: Picture) -> np.ndarray:
     Raises:
         ValueError: the picture is damaged.
     """
-    flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+    return cv2.cvtColor(_decode(picture, _AS_STORED), cv2.COLOR_BGR2RGB)
+
+
+def decode_with_alpha(picture: Picture) -> np.ndarray:
+    """As `decode`, but with the alpha channel (H, W, 4) of a picture that has one."""
+    pixels = _decode(picture, cv2.IMREAD_UNCHANGED)
+    if pixels.ndim == 2:
+        return cv2.cvtColor(pixels, cv2.COLOR_GRAY2RGB)
+    return cv2.cvtColor(pixels, cv2.COLOR_BGRA2RGBA if pixels.shape[2] == 4 else cv2.COLOR_BGR2RGB)
+
+
+def decode_upright(picture: Picture) -> np.ndarray:
+    """As `decode`, turned as EXIF says."""
+    return cv2.cvtColor(_decode(picture, _COLOURS), cv2.COLOR_BGR2RGB)
+
+
+def _decode(picture: Picture, flags: int) -> np.ndarray:
+    """Return what OpenCV makes of a picture."""
     try:
-        bgr = cv2.imdecode(np.frombuffer(picture.data, np.uint8), flags)
+        pixels = cv2.imdecode(np.frombuffer(picture.data, np.uint8), flags)
     except cv2.error as error:
         raise ValueError(f"cannot be decoded: {error.err}") from error
-    if bgr is None or bgr.shape[:2] != (picture.height, picture.width) or 8 * bgr.itemsize != picture.bits:
+    sizes = [(picture.height, picture.width)]
+    if flags == _COLOURS:
+        sizes.append((picture.width, picture.height))
+    if pixels is None or pixels.shape[:2] not in sizes or 8 * pixels.itemsize != picture.bits:
         raise ValueError("is damaged")
-    return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
+    return pixels
 
 
 def _read_jpeg(data: bytes) -> Picture:
@@ -140,7 +164,7 @@ def _jpeg_segments(data: bytes) -> Iterator[tuple[int, bytes]]:
 
 
 def _read_png(data: bytes) -> Picture:
-    """Keep the chunks that make the pixels: the first tells the size, comments and animations are left out."""
+    """Keep the chunks that make and turn the pixels, of which the first tells the size: no comments, no animations."""
     if data[8:16] != b"\0\0\0\rIHDR":
         raise ValueError("is a damaged PNG")
     kept, place = [_PNG_START], len(_PNG_START)

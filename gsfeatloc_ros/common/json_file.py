@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from gsfeatloc_ros.common.safe_files import open_regular
+from gsfeatloc_ros.common.safe_files import read_regular
 
 # Poses of a hundred thousand photos.
 _MAX_BYTES = 100_000_000
@@ -21,10 +21,7 @@ def read_json(path: Path) -> Any:
         ValueError: it is no JSON, or too large.
         OSError: it cannot be read, or is a folder, a pipe, a device.
     """
-    with open_regular(path) as stream:
-        data = stream.read(_MAX_BYTES + 1)
-    if len(data) > _MAX_BYTES:
-        raise ValueError(f"is of more than {_MAX_BYTES} bytes")
+    data = read_regular(path, _MAX_BYTES)
     try:
         return json.loads(data, parse_int=lambda digits: (int if len(digits) <= _MAX_DIGITS else float)(digits))
     except RecursionError as error:

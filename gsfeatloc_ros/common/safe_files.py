@@ -23,6 +23,20 @@ def open_regular(path: Path) -> BufferedReader:
     return _open(path, 0)
 
 
+def read_regular(path: Path, limit: int) -> bytes:
+    """Read a whole file, of at most so many bytes.
+
+    Raises:
+        ValueError: it is larger.
+        OSError: it cannot be read, or is a folder, a pipe, a device.
+    """
+    with open_regular(path) as stream:
+        data = stream.read(limit + 1)
+    if len(data) > limit:
+        raise ValueError(f"is of more than {limit // 10**6} megabytes")
+    return data
+
+
 def open_own(path: Path) -> BufferedReader:
     """Open a file that was written here before: a cache, say, whose content nobody checks against what it is of.
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from gsfeatloc_ros.common.camera import Camera
+from gsfeatloc_ros.evaluate.photo_file import read_photo
 
 TEST_EVERY = 8
 """Of data without a split, one photo of so many, by name, is for testing, as in 3DGS and Mip-NeRF360."""
@@ -67,10 +67,10 @@ class Scene:
             ValueError: the file is not an image or not of its camera's size.
         """
         width, height = photo.camera.width, photo.camera.height
-        pixels = stored = read_image(photo.path)
+        pixels = stored = read_photo(photo.path)
         if pixels.shape[:2] != (height, width):
             # COLMAP takes pixels as they are stored, other programs as EXIF says that they are turned.
-            pixels = read_image(photo.path, upright=True)
+            pixels = read_photo(photo.path, upright=True)
         if pixels.shape[:2] != (height, width):
             raise ValueError(f"{photo.path}: is {stored.shape[1]}x{stored.shape[0]}, its camera is {width}x{height}")
         if pixels.shape[2] == 3:
@@ -78,27 +78,3 @@ class Scene:
         alpha = pixels[..., 3:] / 255.0
         on_background = alpha * pixels[..., :3] + (1.0 - alpha) * 255.0 * np.array(self.background)
         return np.rint(on_background).astype(np.uint8)
-
-
-def read_image(path: Path, upright: bool = False) -> np.ndarray:
-    """Read an image as RGB or, where it has an alpha channel, RGBA: (H, W, 3 or 4) uint8; a grey one has three equal.
-
-    Args:
-        path: of the file.
-        upright: turned as EXIF says, without its alpha channel; otherwise as it is stored.
-
-    Raises:
-        ValueError: the file is missing or not an image of 8 or 16 bits.
-    """
-    if not path.is_file():
-        raise ValueError(f"{path}: is missing")
-    pixels = cv2.imread(str(path), cv2.IMREAD_COLOR if upright else cv2.IMREAD_UNCHANGED)
-    if pixels is None:
-        raise ValueError(f"{path}: is not an image")
-    if pixels.dtype == np.uint16:
-        pixels = cv2.convertScaleAbs(pixels, alpha=255 / 65535)
-    if pixels.dtype != np.uint8:
-        raise ValueError(f"{path}: is not an image of 8 or 16 bits")
-    if pixels.ndim == 2:
-        return cv2.cvtColor(pixels, cv2.COLOR_GRAY2RGB)
-    return cv2.cvtColor(pixels, cv2.COLOR_BGRA2RGBA if pixels.shape[2] == 4 else cv2.COLOR_BGR2RGB)

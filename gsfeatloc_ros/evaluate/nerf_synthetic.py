@@ -12,8 +12,9 @@ from pathlib import Path
 import numpy as np
 
 from gsfeatloc_ros.common.camera import Camera
-from gsfeatloc_ros.evaluate.dataset import PosedPhoto, read_image
+from gsfeatloc_ros.evaluate.dataset import PosedPhoto
 from gsfeatloc_ros.evaluate.nerfstudio import frame_pose, naming, read_transforms
+from gsfeatloc_ros.evaluate.photo_file import photo_size
 
 
 def load(folder: Path) -> tuple[list[PosedPhoto], np.ndarray]:
@@ -37,7 +38,7 @@ def load(folder: Path) -> tuple[list[PosedPhoto], np.ndarray]:
         half_angle = 0.5 * float(transforms["camera_angle_x"])
         if not 0 < half_angle < math.pi / 2:
             raise ValueError(f"camera_angle_x {2 * half_angle:g} is not between 0 and pi")
-    height, width = read_image(frames[0][0]).shape[:2]
+    width, height = photo_size(frames[0][0])
     focal_length = 0.5 * width / math.tan(half_angle)
     K = [[focal_length, 0.0, 0.5 * (width - 1)], [0.0, focal_length, 0.5 * (height - 1)], [0.0, 0.0, 1.0]]
     camera = Camera(width, height, np.array(K))

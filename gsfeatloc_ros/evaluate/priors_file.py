@@ -19,10 +19,13 @@ from pathlib import Path
 import numpy as np
 
 from gsfeatloc_ros.common.geometry import pose_from_numbers
+from gsfeatloc_ros.common.safe_files import read_regular
 from gsfeatloc_ros.common.tum import tum_fields
 from gsfeatloc_ros.evaluate.dataset import Scene
 from gsfeatloc_ros.evaluate.protocol import PhotoPrior
 
+# Some numbers of each of a million photos.
+_MAX_BYTES = 500_000_000
 _DELIMITERS = (",", ";", "\t")
 _NUMBERS = ("tx", "ty", "tz", "qx", "qy", "qz", "qw")
 
@@ -39,7 +42,7 @@ def read_priors(path: Path, scene: Scene) -> list[PhotoPrior]:
     indices |= {photo.name: index for index, photo in enumerate(scene.photos)}
     poses = []
     try:
-        lines = _text(path.read_bytes()).splitlines()
+        lines = _text(read_regular(path, _MAX_BYTES)).splitlines()
         for number, name, values in _csv_lines(lines) if path.suffix.lower() == ".csv" else _tum_lines(lines):
             if name in indices:
                 poses.append((indices[name], _pose(number, values)))

@@ -15,6 +15,7 @@ from typing import Any
 
 import gsfeatloc_ros
 from gsfeatloc_ros.common.replaced_file import replaced_file
+from gsfeatloc_ros.common.safe_files import open_regular, read_regular
 from gsfeatloc_ros.evaluate.dataset import Scene
 from gsfeatloc_ros.evaluate.metrics import QueryResult
 from gsfeatloc_ros.evaluate.protocol import PhotoPrior
@@ -25,6 +26,9 @@ _NOT_MEASURED = (
     *("align", "benchmark", "client", "crosscheck", "inspect", "node", "replay", "ros_io", "simulate", "tools"),
     "evaluate/report",
 )
+
+# Of dataparser_transforms.json, which has 17 numbers.
+_MAX_PLACED_BYTES = 100_000_000
 
 
 @dataclass(frozen=True)
@@ -96,7 +100,8 @@ class Record:
                 file.writelines([*lines, _line(fingerprint.id, result)])
 
     def _read(self, path: Path) -> None:
-        text = path.read_text(encoding="utf-8", errors="replace")
+        with open_regular(path) as stream:
+            text = stream.read().decode("utf-8", errors="replace")
         complete = text.endswith("\n") or not text
         for line in text.splitlines():
             try:
@@ -158,12 +163,12 @@ def hash_photos(scene: Scene) -> str:
 
 
 def fingerprint_of(run: Run, scene: SceneHash, priors: Iterable[PhotoPrior]) -> Fingerprint:
-    """Return the fingerprint of a run in a scene; raise OSError where the file of where its map lies cannot be read."""
+    """Return the fingerprint of a run in a scene; raise OSError or ValueError where its map's place cannot be read."""
     placed = run.dataparser_transforms
     return Fingerprint(
         settings=run.settings(),
         code=_code(),
-        map=scene.map if placed is None else _digest([scene.map.encode(), placed.read_bytes()]),
+        map=scene.map if placed is None else _digest([scene.map.encode(), read_regular(placed, _MAX_PLACED_BYTES)]),
         photos=scene.photos,
         priors=_digest(prior.T_map_camera.tobytes() for prior in priors),
     )
@@ -176,7 +181,12 @@ def _code() -> str:
 
 
 def _files(paths: Iterable[Path]) -> str:
-    return _digest(path.read_bytes() for path in paths)
+    return _digest(map(_content, paths))
+
+
+def _content(path: Path) -> bytes:
+    with open_regular(path) as stream:
+        return hashlib.file_digest(stream, "sha256").digest()
 
 
 def _digest(parts: Iterable[bytes]) -> str:

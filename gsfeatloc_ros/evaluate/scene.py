@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from gsfeatloc_ros.evaluate import colmap, nerf_synthetic, nerfstudio
-from gsfeatloc_ros.evaluate.dataset import PosedPhoto, Scene, read_image
+from gsfeatloc_ros.evaluate.dataset import PosedPhoto, Scene
+from gsfeatloc_ros.evaluate.photo_file import photo_size, read_photo
 from gsfeatloc_ros.localize.engine import load_renderer
 from gsfeatloc_ros.localize.settings import MapSettings, RendererSettings
 from gsfeatloc_ros.maps import GaussianMap, load_map
@@ -56,7 +57,7 @@ def load_scene(folder: str | Path, map_path: str | Path | None = None) -> Scene:
         map_path=Path(map_path) if map_path else _find_map(folder),
         photos=tuple(_with_cameras_of_their_size(photos)),
         trajectory=trajectory,
-        background=_WHITE if read_image(photos[0].path).shape[2] == 4 else _BLACK,
+        background=_WHITE if read_photo(photos[0].path).shape[2] == 4 else _BLACK,
     )
 
 
@@ -115,7 +116,7 @@ def _with_cameras_of_their_size(photos: Sequence[PosedPhoto]) -> Iterator[PosedP
     for photo in photos:
         camera, kind = photo.camera, (photo.path.parent, photo.camera.width, photo.camera.height)
         if kind not in sizes:
-            height, width = read_image(photo.path).shape[:2]
+            width, height = photo_size(photo.path)
             # The longer side says how much; the other may have been rounded.
             scale = max(width, height) / max(camera.width, camera.height)
             off = abs(width - scale * camera.width) + abs(height - scale * camera.height)

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import json
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from gsfeatloc_ros.common.json_file import read_json
 from gsfeatloc_ros.common.words import shortened
 from gsfeatloc_ros.maps.files import find_map
 from gsfeatloc_ros.maps.ply_file import PlyFile
+from gsfeatloc_ros.maps.sog import read_meta
 
 _UNKNOWN = "not said in the file"
 _MAX_PRODUCER = 200
@@ -52,17 +52,15 @@ def _told(path: Path, head: bytes) -> tuple[str, str]:
     if head.startswith(b"\x1f\x8b"):
         return ".spz", _UNKNOWN
     if head.startswith(b"PK"):
-        with zipfile.ZipFile(path) as archive:
-            name = next(name for name in archive.namelist() if name.rpartition("/")[2] == "meta.json")
-            return ".sog", _generator(json.loads(archive.read(name)))
+        return ".sog", _generator(read_meta(path))
     if head.startswith(b"{"):
-        meta = json.loads(path.read_bytes())
+        meta = read_json(path)
         kind = "streamed .sog" if "lodLevels" in meta else "folder of images (unbundled .sog, or gsplat's PNG)"
         return kind, _generator(meta)
     return ".splat", _UNKNOWN
 
 
-def _generator(meta: dict[str, Any]) -> str:
+def _generator(meta: Any) -> str:
     """Return who made a .sog, as its meta.json says it."""
-    asset = meta.get("asset")
+    asset = meta.get("asset") if isinstance(meta, dict) else None
     return str(asset.get("generator", _UNKNOWN)) if isinstance(asset, dict) else _UNKNOWN

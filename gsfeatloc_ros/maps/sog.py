@@ -83,6 +83,17 @@ def read_sog(path: Path, options: ReadOptions) -> GaussianMap:
         raise MapError(f"{path}: is truncated or damaged: {error}") from error
 
 
+def read_meta(path: Path) -> object:
+    """Return the content of the meta.json in a .sog; raise as `read_sog`."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return json.loads(
+                _read_member(path, archive, _folder_of_meta(path, archive) + "meta.json", _MAX_META_BYTES)
+            )
+    except ZIP_ERRORS as error:
+        raise MapError(f"{path}: is truncated or damaged: {error}") from error
+
+
 def read_unbundled_sog(path: Path, options: ReadOptions) -> GaussianMap:
     """Read a map from the meta.json of an unbundled .sog.
 

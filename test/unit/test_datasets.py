@@ -9,6 +9,7 @@ import numpy as np
 import PIL.Image
 import pycolmap
 import pytest
+from picture_files import png
 from room_datasets import angle_x, colmap_camera, save_image, write_colmap, write_nerf_synthetic
 
 from gsfeatloc_ros.common.camera import Camera
@@ -199,7 +200,20 @@ def test_without_test_photos_they_are_those_that_made_no_map(tmp_path, transform
 def test_photo_that_is_not_an_image(tmp_path, transforms):
     save_scene(tmp_path, transforms)
     (tmp_path / "images/b.png").write_bytes(b"not a picture")
-    with pytest.raises(ValueError, match=r"b\.png: is not an image"):
+    with pytest.raises(ValueError, match=r"b\.png: is no JPEG or PNG"):
+        load_scene(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [(png(30_000, 30_000, b""), "30000x30000, more than 50 megapixels"), (png(8, 6, bytes(10**6)), "holds more than")],
+    ids=["pixels", "bytes"],
+)
+def test_photo_that_takes_more_than_a_cameras_is_not_decoded(tmp_path, transforms, content, says):
+    """OpenCV's own reading took gigabytes for the first, and for a moment in the second."""
+    save_scene(tmp_path, transforms)
+    (tmp_path / "images/b.png").write_bytes(content)
+    with pytest.raises(ValueError, match=rf"b\.png: .*{says}"):
         load_scene(tmp_path)
 
 
