@@ -63,6 +63,8 @@ class Evidence:
         reprojection_error_px: RMS of the inliers' reprojection errors in pixels of the localized photo.
         deviation: distance of the pose from the prior in standard deviations of the prior.
         blur_px: extent of the photo's blur in pixels of the localized photo; 0 for a sharp one.
+        bend_px: error in pixels that the covariance allows for, because the corners are off in a smooth pattern that no
+            pose and no camera explains, as in a bent map; 0 where they are not.
         focal_error: how much longer than calibrated the focal length fits the photo, relative.
         focal_sigma: standard deviation of that.
         probability_wrong: that the pose is wrong.
@@ -89,6 +91,7 @@ class Evidence:
     reprojection_error_px: float = float("nan")
     deviation: float = float("nan")
     blur_px: float = float("nan")
+    bend_px: float = float("nan")
     focal_error: float = float("nan")
     focal_sigma: float = float("nan")
     probability_wrong: float = float("nan")

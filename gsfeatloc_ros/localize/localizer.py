@@ -255,6 +255,7 @@ class Localizer:
                 changed=comparison.changed_share(),
                 reprojection_error_px=view.solution.reprojection_error,
                 deviation=prior.deviation(pose) if prior else float("nan"),
+                bend_px=float(np.sqrt(fit.field.bent_variance)) if fit else float("nan"),
                 focal_error=fit.focal if fit else float("nan"),
                 focal_sigma=fit.focal_sigma if fit else float("nan"),
             )
@@ -309,13 +310,13 @@ class _Candidate:
             reason = f"the pose found is not believed: {self.reasons_against[0]}"
             estimate = Estimate(Status.REJECTED, reason, evidence=evidence)
         else:
-            estimate = Estimate(
-                Status.LOCALIZED,
+            reason = (
                 f"{evidence.inliers} inliers of {evidence.lifted} corners, correlation {evidence.correlation:.2f}; "
-                f"{evidence.changed:.0%} of the photo is not as in the map",
-                *self.pose,
-                evidence,
+                f"{evidence.changed:.0%} of the photo is not as in the map"
             )
+            if evidence.bend_px > 0:
+                reason += "; the corners are off in a smooth pattern: the map is bent there, or the camera another"
+            estimate = Estimate(Status.LOCALIZED, reason, *self.pose, evidence)
         changed = partial(changed_mask, photo, view) if view.solution else None
         return Trace(estimate, photo, view.render, view.correspondences, changed)
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.geometry import moved, skew
+from gsfeatloc_ros.pose.residual_field import ResidualField
 from gsfeatloc_ros.pose.solve import Correspondences, PoseOptions, shared_variance, whiten
 
 # Parameters beside the pose: focal length (relative), k1, and by how much the camera turns, in radians about its axes,
@@ -39,6 +40,7 @@ class CameraFit:
         T_map_camera: (4, 4) pose, of the middle row.
         covariance: (6, 6) of it, as that of a PoseSolution; what the camera may be off by is part of it.
         followed: (5,) of focal, k1 and rolling what the pose follows.
+        field: of the residuals that pose and camera leave.
     """
 
     focal: float
@@ -50,6 +52,7 @@ class CameraFit:
     T_map_camera: np.ndarray
     covariance: np.ndarray
     followed: np.ndarray
+    field: ResidualField
 
     def reprojection_errors(self, camera: Camera, found: Correspondences) -> np.ndarray:
         """Return the distances (M,) in pixels between pixels and points seen by this camera; inf behind it."""
@@ -108,6 +111,7 @@ def _fit(camera: Camera, calibrated: _State, found: Correspondences, options: Po
         T_map_camera=kept.pose,
         covariance=problem.covariance(system, _CALIBRATED)[:6, :6] + np.outer(shift, shift),
         followed=kept.camera,
+        field=problem.field(system),
     )
 
 
@@ -183,9 +187,13 @@ class _Problem:
         inflation = max((weights * system.squared).sum() / max(2 * weights.sum() - len(known), 1.0), 1.0)
         weighted = (weights[:, None, None] * system.jacobian).reshape(-1, len(known))
         of_a_match = weighted.T @ system.jacobian.reshape(-1, len(known)) / weights.sum()
-        shared = shared_variance(self.found.pixels, system.residuals, self.options)
+        shared = shared_variance(self.calibrated, self.field(system), self.options)
         # What they have in common counts as one match with that error, beside what is known before.
         return inflation * np.linalg.inv(system.hessian + known) + np.linalg.inv(of_a_match / shared + known)
+
+    def field(self, system: _System) -> ResidualField:
+        """Return what the residuals have in common."""
+        return ResidualField.of(self.found.pixels, system.residuals, self.options.max_reprojection_error)
 
     def at(self, state: _State) -> _System:
         """Return the whitened problem at a state with Cauchy's weights (iteratively reweighted least squares)."""

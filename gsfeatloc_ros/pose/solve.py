@@ -15,6 +15,7 @@ import poselib
 from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.geometry import invert, make_pose, moved, skew
 from gsfeatloc_ros.common.parameter import parameter
+from gsfeatloc_ros.pose.residual_field import ResidualField
 
 _MIN_ITERATIONS, _MAX_ITERATIONS = 200, 10_000
 # A P3P sample and one match to choose among its solutions; under-determined sets have no covariance.
@@ -23,9 +24,6 @@ MIN_POINTS = 4
 _MIN_PIXEL_SIGMA = 0.1
 _REFINE_ITERATIONS = 20
 _NOISE_ITERATIONS = 5
-# Matches nearer to each other than this, in pixels, are neighbours; all pairs of at most so many are looked at.
-_NEIGHBOUR_DISTANCE = 25.0
-_MAX_PAIRED = 400
 # Poses that are not plausible are passed over, with their inliers, this many times.
 _MAX_IMPLAUSIBLE_POSES = 3
 # A step that lowers the cost by less than this share ends the refinement: a thousandth of a standard deviation is left.
@@ -241,27 +239,23 @@ def refine_pose(
     inflation = max((weights * squared).sum() / degrees_of_freedom, 1.0)
     weighted = (weights[:, None, None] * linear.by_pose).reshape(-1, 6)
     information_of_a_match = weighted.T @ linear.by_pose.reshape(-1, 6) / weights.sum()
-    shared = shared_variance(found.pixels, linear.residuals, options) * np.linalg.inv(information_of_a_match)
+    field = ResidualField.of(found.pixels, linear.residuals, options.max_reprojection_error)
+    shared = shared_variance(camera, field, options) * np.linalg.inv(information_of_a_match)
     return pose, covariance * inflation + shared
 
 
-def shared_variance(pixels: np.ndarray, residuals: np.ndarray, options: PoseOptions) -> float:
+def shared_variance(camera: Camera, field: ResidualField, options: PoseOptions) -> float:
     """Return the variance, in square pixels along an axis, of the error that all matches have in common.
 
     Args:
-        pixels: (M, 2) of the matches.
-        residuals: (M, 2). Those of neighbours are alike where the map is bent, or the photo blurred, or the lens not as
-            it was calibrated.
-        options: how much of that is taken to be common to all.
+        camera: of the photo. A photo that shows a part of the lens (its centre is not the photo's) averages less over
+            the lens's errors: the variance grows as that part shrinks.
+        field: of the residuals.
+        options: how much of what neighbours have in common is taken to be common to all.
     """
-    step = 1 + len(pixels) // _MAX_PAIRED
-    pixels, residuals = pixels[::step], residuals[::step]
-    squares = (pixels**2).sum(axis=1)
-    near = squares[:, None] + squares - 2 * pixels @ pixels.T < _NEIGHBOUR_DISTANCE**2
-    np.fill_diagonal(near, False)
-    pairs = near.sum()
-    alike = 0.5 * float((near * (residuals @ residuals.T)).sum()) / pairs if pairs else 0.0
-    return options.shared_error**2 + options.shared_share * max(alike, 0.0)
+    full = 2 * np.maximum(camera.K[:2, 2] + 0.5, [camera.width, camera.height] - (camera.K[:2, 2] + 0.5))
+    part = camera.width * camera.height / float(np.prod(full))
+    return options.shared_error**2 / part + options.shared_share * field.near + field.bent_variance
 
 
 def whiten(

@@ -20,6 +20,7 @@ from gsfeatloc_ros.common.geometry import (
     translation_error,
 )
 from gsfeatloc_ros.pose.lift import DEPTH_SIGMA_PER_STD, MAX_DEPTH_STD, LiftOptions, lift
+from gsfeatloc_ros.pose.residual_field import ResidualField
 from gsfeatloc_ros.pose.solve import (
     MIN_POINTS,
     Correspondences,
@@ -27,6 +28,7 @@ from gsfeatloc_ros.pose.solve import (
     _linearize,
     refine_pose,
     reprojection_errors,
+    shared_variance,
     solve_pose,
 )
 from gsfeatloc_ros.render.base import Render
@@ -253,6 +255,22 @@ def test_errors_that_matches_share_do_not_average_out() -> None:
         for found, _ in (scene(0, count=1000, noise=0.3), scene(0, count=100_000, noise=0.3))
     )
     assert np.trace(many[:3, :3]) > 0.5 * np.trace(few[:3, :3])
+
+
+def test_a_crop_is_less_sure_than_the_photo_it_is_of() -> None:
+    """The lens's errors average out less over a part of it; one that shows its middle cannot be told from a photo."""
+    field = ResidualField(near=0.0, smooth=0.0, total=0.01)
+    options = PoseOptions()
+    corner = replace(CAMERA, width=CAMERA.width // 2, height=CAMERA.height // 2)
+    whole, part = (shared_variance(camera, field, options) for camera in (CAMERA, corner))
+    assert part == pytest.approx(4 * whole, rel=0.05)
+
+
+def test_in_a_bent_map_the_covariance_grows() -> None:
+    found, _ = scene(0, noise=0.3)
+    bent = replace(found, pixels=found.pixels + 0.6 * np.sin(found.pixels[:, ::-1] / 60))
+    plain, wide = (refine_pose(CAMERA, POSE, each, PoseOptions())[1] for each in (found, bent))
+    assert np.trace(wide[3:, 3:]) > 100 * np.trace(plain[3:, 3:])
 
 
 def test_reprojection_error_behind_the_camera_is_infinite() -> None:

@@ -1,0 +1,71 @@
+"""What residuals near each other have in common: errors that do not average out over the matches."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+# Matches nearer to each other than the first, in pixels, are neighbours: they share the blur, the splat, the edge.
+# What those between the two have in common is a field that is smooth over the photo.
+_NEIGHBOUR_DISTANCE, _FIELD_DISTANCE = 25.0, 60.0
+# All pairs of at most so many matches are looked at.
+_MAX_PAIRED = 400
+# A smooth field of this variance (square pixels), that is this share of all variance, is more than chance, blur or an
+# unknown shutter leave behind: of right poses in maps that are not bent, 1 in 100 has one (docs/trust.md).
+_MIN_FIELD, _MIN_FIELD_SHARE = 0.025, 0.1
+# The pose absorbs most of such a field: its error is of the order of this variance in square pixels, reached where the
+# field is twice the least that counts.
+_BENT_VARIANCE = 30.0
+
+
+@dataclass(frozen=True)
+class ResidualField:
+    """Variances along an axis, in square pixels, of residuals after pose and camera were fitted.
+
+    Attributes:
+        near: what neighbours have in common. The residuals of neighbours are alike where the photo is blurred or the
+            map is locally off.
+        smooth: what matches have in common that are farther apart. They are alike where the map is bent, or the camera
+            is not as it is taken to be, in a way that no pose explains.
+        total: of all.
+    """
+
+    near: float
+    smooth: float
+    total: float
+
+    @staticmethod
+    def of(pixels: np.ndarray, residuals: np.ndarray, max_error: float) -> ResidualField:
+        """Return the field of residuals (M, 2) at pixels (M, 2).
+
+        Residuals longer than `max_error` pixels count among neighbours alone: a cluster of wrong matches is no field.
+        """
+        step = 1 + len(pixels) // _MAX_PAIRED
+        pixels, residuals = pixels[::step], residuals[::step]
+        squares = (pixels**2).sum(axis=1)
+        distances = squares[:, None] + squares - 2 * pixels @ pixels.T
+        products = 0.5 * residuals @ residuals.T
+        lengths = 2 * np.diag(products)
+        agrees = lengths <= max_error**2
+        near = distances < _NEIGHBOUR_DISTANCE**2
+        apart = ~near & (distances < _FIELD_DISTANCE**2) & agrees & agrees[:, None]
+        np.fill_diagonal(near, False)
+        return ResidualField(
+            _mean(products, near), _mean(products, apart), 0.5 * float(lengths[agrees].mean()) if agrees.any() else 0.0
+        )
+
+    @property
+    def bent_variance(self) -> float:
+        """Variance, in square pixels along an axis, of what the pose is off by because the map is bent; 0 if it is not.
+
+        How much of a bend the pose absorbs cannot be seen, only that what is left is too much.
+        """
+        excess = min(self.smooth / _MIN_FIELD, self.smooth / (_MIN_FIELD_SHARE * self.total)) if self.total else 0.0
+        return _BENT_VARIANCE * float(np.clip(excess - 1, 0, 1))
+
+
+def _mean(values: np.ndarray, mask: np.ndarray) -> float:
+    """Return the mean of the values (M, M) that a mask names, 0 for none and where it is negative."""
+    count = mask.sum()
+    return max(float((values * mask).sum()) / count, 0.0) if count else 0.0

@@ -1,0 +1,78 @@
+"""What residuals near each other have in common, held against fields that are known."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gsfeatloc_ros.pose.residual_field import ResidualField
+
+SIZE = np.array([640, 480])
+
+
+def pixels(seed: int, count: int = 400) -> np.ndarray:
+    return np.random.default_rng(seed).random((count, 2)) * SIZE
+
+
+def bend(at: np.ndarray, amplitude: float) -> np.ndarray:
+    """Residuals (M, 2) that vary smoothly, half a wave over the photo's height."""
+    return amplitude * np.stack([np.sin(at[:, 1] / 150), np.cos(at[:, 0] / 150)], axis=1)
+
+
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_few_residuals_have_no_field(count: int) -> None:
+    field = ResidualField.of(np.zeros((count, 2)), np.zeros((count, 2)), 3.0)
+    assert field == ResidualField(0.0, 0.0, 0.0)
+    assert field.bent_variance == 0
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_independent_residuals_have_nothing_in_common(seed: int) -> None:
+    at = pixels(seed)
+    field = ResidualField.of(at, np.random.default_rng(seed + 1).normal(0, 0.3, at.shape), 3.0)
+    assert field.total == pytest.approx(0.09, rel=0.3)
+    assert field.near < 0.02
+    assert field.smooth < 0.01
+    assert field.bent_variance == 0
+
+
+def test_the_smooth_part_is_the_variance_of_a_bend() -> None:
+    at = pixels(0)
+    noise = np.random.default_rng(1).normal(0, 0.3, at.shape)
+    field = ResidualField.of(at, bend(at, 0.5) + noise, 3.0)
+    # Waves of amplitude 0.5, nearly in phase 25 to 60 pixels apart; there are more pairs in the middle, at their crest.
+    assert field.smooth == pytest.approx(0.15, rel=0.15)
+    assert field.total == pytest.approx(0.5 * (bend(at, 0.5) ** 2).sum(axis=1).mean() + 0.09, rel=0.1)
+    assert field.bent_variance == 30
+
+
+def test_the_pairs_are_those_of_a_plain_loop() -> None:
+    at, residuals = pixels(3, 60) / 4, np.random.default_rng(4).normal(0, 1.5, (60, 2))
+    near, smooth = [], []
+    for i in range(60):
+        for j in range(60):
+            distance, product = np.linalg.norm(at[i] - at[j]), residuals[i] @ residuals[j] / 2
+            if i != j and distance < 25:
+                near.append(product)
+            elif 25 <= distance < 60 and max(np.linalg.norm(residuals[i]), np.linalg.norm(residuals[j])) <= 2:
+                smooth.append(product)
+    field = ResidualField.of(at, residuals, 2.0)
+    assert field.near == pytest.approx(max(np.mean(near), 0))
+    assert field.smooth == pytest.approx(max(np.mean(smooth), 0))
+
+
+def test_what_only_neighbours_share_is_no_bend() -> None:
+    """As in a blurred photo: clusters 10 pixels wide are off together, each in its own way."""
+    rng = np.random.default_rng(5)
+    centres, shifts = pixels(6, 80), rng.normal(0, 0.5, (80, 2))
+    at = (centres[:, None] + rng.uniform(-5, 5, (80, 5, 2))).reshape(-1, 2)
+    field = ResidualField.of(at, np.repeat(shifts, 5, axis=0), 3.0)
+    assert field.near > 0.1
+    assert field.bent_variance == 0
+
+
+def test_wrong_matches_are_no_bend() -> None:
+    at = pixels(7)
+    residuals = np.random.default_rng(8).normal(0, 0.2, at.shape)
+    residuals[at[:, 0] < 150] += 8.0
+    assert ResidualField.of(at, residuals, 3.0).bent_variance == 0
