@@ -6,35 +6,33 @@ import numpy as np
 
 from gsfeatloc_ros.localize.evidence import coverage
 from gsfeatloc_ros.localize.query import Query
-from gsfeatloc_ros.localize.search import MIN_HINT
 
+# With fewer features, a photo is looked for nowhere.
+MIN_FEATURES = 8
 # Brightness that differs by no more, of 255, is one shade; photos have up to 9 % of their pixels around their median.
 _SHADE = 3
 _MAX_OF_ONE_SHADE = 0.95
 _WHY = "is the lens covered, or is it too dark, too bright or out of focus?"
 
 
-def too_little(query: Query, small: Query) -> str:
-    """Return why no pose can be an answer, whatever else is found; empty where one can.
+def too_little(query: Query) -> str:
+    """Return why no pose can be an answer for a photo, whatever is found; empty where one can.
 
     Inliers are among the photo's corners, so that these must be as many and as far spread as an answer's.
-
-    Args:
-        query: the photo.
-        small: the same, as it is searched.
     """
-    clock, limits = query.clock, query.components.options.limits
-    with clock.stage("features"):
-        features = len(small.features)
-    if features < MIN_HINT:
-        return f"{features} features in the photo: {_WHY}"
-    corners, camera = query.tracker.corners, query.photo.camera
+    limits, corners, camera = query.components.options.limits, query.tracker.corners, query.photo.camera
     share = coverage(corners, camera.width, camera.height)
     if len(corners) < limits.min_inliers or share < limits.min_coverage:
         needed = f"at least {limits.min_inliers} in {limits.min_coverage:.0%} needed"
         return f"{len(corners)} corners in {share:.0%} of the photo ({needed}): {_WHY}"
     one_shade = _share_of_one_shade(query.photo.gray()[query.photo.seen])
     return f"{one_shade:.1%} of the photo is of one shade: {_WHY}" if one_shade >= _MAX_OF_ONE_SHADE else ""
+
+
+def too_few_features(small: Query) -> str:
+    """Return why it is no use to look for a photo, as it is searched, by its features; empty where it is."""
+    features = len(small.features)
+    return f"{features} features in the photo: {_WHY}" if features < MIN_FEATURES else ""
 
 
 def _share_of_one_shade(levels: np.ndarray) -> float:

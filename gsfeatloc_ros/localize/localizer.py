@@ -19,7 +19,7 @@ from gsfeatloc_ros.common.stage_clock import OutOfTime, StageClock
 from gsfeatloc_ros.index import ViewIndex
 from gsfeatloc_ros.localize.blur import estimate_blur
 from gsfeatloc_ros.localize.comparison import changed_mask, compare, preference
-from gsfeatloc_ros.localize.content import too_little
+from gsfeatloc_ros.localize.content import too_few_features, too_little
 from gsfeatloc_ros.localize.estimate import Estimate, Status, Trace
 from gsfeatloc_ros.localize.evidence import (
     Evidence,
@@ -34,7 +34,6 @@ from gsfeatloc_ros.localize.options import LocalizerOptions
 from gsfeatloc_ros.localize.prior import Prior
 from gsfeatloc_ros.localize.query import Components, MatchedView, Query
 from gsfeatloc_ros.localize.search import SEARCH_WIDTH, Search
-from gsfeatloc_ros.maps.gaussian_map import Reading
 from gsfeatloc_ros.match import Matcher, Tracker, create_tracker
 from gsfeatloc_ros.pose.camera_fit import CameraFit, fit_camera
 from gsfeatloc_ros.pose.solve import Correspondences, reprojection_errors
@@ -56,10 +55,11 @@ _MIN_LEAD = 3.0
 class Localizer:
     """Finds where a photo was taken, in two steps.
 
-    First features: a small render at the prior is matched with the photo, the matches are lifted to 3D by the render's
-    depth and solved for the pose. Where that leads to no answer, or there is no prior, the index of the map's views
-    tells where else to look; without an index, views around the prior are tried. Then pixels: the photo's corners are
-    tracked to a render at the estimate, lifted and solved, until the render is where the photo is.
+    First small: where the prior is good, the photo's corners are tracked into a small render there. Where it is not, or
+    that leads to no answer, features of photo and render are matched. Matches are lifted to 3D by the render's depth
+    and solved for the pose. If there is still no answer, or no prior, the index of the map's views tells where else to
+    look; without an index, views around the prior are tried. Then at full size: the photo's corners are tracked to a
+    render at the estimate, lifted and solved, until the render is where the photo is.
 
     That last render is what the estimate is verified by: what the map predicts there must match the photo.
     """
@@ -141,26 +141,27 @@ class Localizer:
         return replace(trace, estimate=replace(trace.estimate, milliseconds=clock.milliseconds()))
 
     def _search(self, query: Query, prior: Prior | None) -> Trace:
-        """Match small views of the map, first at the prior, then where else it may be, and refine what they suggest."""
+        """Look at small views of the map, at the prior and then where else it may be, and refine what they suggest."""
         small = query.limited(SEARCH_WIDTH)
         search = Search(small, prior, self._now)
-        first: _Candidate | None = None
+        likeliest: _Candidate | None = None
         try:
-            reason = too_little(query, small)
+            reason = too_little(query)
             if reason:
                 return Trace(Estimate(Status.FAILED, reason), query.photo)
             for candidate in self._candidates(query, search, prior):
-                first = first or candidate
+                if likeliest is None or candidate.evidence.inliers > likeliest.evidence.inliers:
+                    likeliest = candidate
                 if candidate.believed:
                     best, rivals = self._best(query, candidate, search, prior)
                     return best.trace(query.photo, search, rivals)
                 if candidate.only_the_camera_is_wrong:
                     return candidate.trace(query.photo, search)
         except OutOfTime:
-            return _out_of_time(query, search, first)
-        if first is not None:
-            return first.trace(query.photo, search)
-        return _nothing_in_common(query.photo, len(small.features), search, self._components.renderer.reading)
+            return _out_of_time(query, search, likeliest)
+        if likeliest is not None:
+            return likeliest.trace(query.photo, search)
+        return _nothing_in_common(small, search, query.photo)
 
     def _candidates(self, query: Query, search: Search, prior: Prior | None) -> Iterator[_Candidate]:
         """Yield what the poses of a search lead to, judged."""
@@ -321,20 +322,23 @@ class _Candidate:
         return Trace(estimate, photo, view.render, view.correspondences, changed)
 
 
-def _out_of_time(query: Query, search: Search, first: _Candidate | None) -> Trace:
-    """Time is up, and there is no answer: say what was looked at, and of the first pose found why it is none yet."""
+def _out_of_time(query: Query, search: Search, likeliest: _Candidate | None) -> Trace:
+    """Time is up, and there is no answer: say what was looked at, and of the likeliest pose why it is none yet."""
     reason = f"not found within {query.components.options.deadline:.2f} s: looked {search.looked or 'nowhere yet'}"
-    if first is None:
+    if likeliest is None:
         return Trace(Estimate(Status.FAILED, reason, evidence=search.counted(Evidence())), query.photo)
-    against = (*first.reasons_against, "other places that may explain the photo were not looked at")[0]
+    against = (*likeliest.reasons_against, "other places that may explain the photo were not looked at")[0]
     reason = f"{reason}; the pose found is not believed: {against}"
-    estimate = Estimate(Status.REJECTED, reason, evidence=search.counted(first.evidence))
-    return replace(first.trace(query.photo, search), estimate=estimate)
+    estimate = Estimate(Status.REJECTED, reason, evidence=search.counted(likeliest.evidence))
+    return replace(likeliest.trace(query.photo, search), estimate=estimate)
 
 
-def _nothing_in_common(photo: Photo, features: int, search: Search, reading: Reading) -> Trace:
+def _nothing_in_common(small: Query, search: Search, photo: Photo) -> Trace:
     """None of the views that were searched suggested a pose; it may be that the map is read wrong."""
-    looked = search.looked
+    looked, features, reading = search.looked, len(small.features), small.components.renderer.reading
+    reason = too_few_features(small)
+    if reason:
+        return Trace(Estimate(Status.FAILED, reason, evidence=search.counted(Evidence())), photo)
     if search.best is None and not looked:
         reason = "there is neither a prior nor an index of views in which to look without one (index.build)"
         return Trace(Estimate(Status.FAILED, reason, evidence=search.counted(Evidence())), photo)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sized
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import cv2
@@ -87,6 +87,14 @@ class Components:
     index: ViewIndex | None = None
 
 
+@dataclass
+class _LastRender:
+    """What was rendered last, and from which pose (4, 4)."""
+
+    pose: np.ndarray = field(default_factory=lambda: np.eye(4))
+    render: Render | None = None
+
+
 @dataclass(frozen=True, eq=False)
 class Query:
     """A photo that is being localized.
@@ -110,7 +118,8 @@ class Query:
     @cached_property
     def features(self) -> Sized:
         """The photo's features, as the matcher gives them."""
-        return self.components.matcher.features(self.photo.image)
+        with self.clock.stage("features"):
+            return self.components.matcher.features(self.photo.image)
 
     @cached_property
     def tracker(self) -> Tracker:
@@ -120,13 +129,12 @@ class Query:
 
     def match(self, pose: np.ndarray) -> MatchedView:
         """Render the map at a pose (4, 4), match its features with the photo's, lift the matches and solve."""
-        matcher = self.components.matcher
-        render = self._render(pose)
+        matcher, photo_features, render = self.components.matcher, self.features, self.render(pose)
         with self.clock.stage("features"):
             image = render.device_image()
             features = matcher.features(image)
         with self.clock.stage("match"):
-            matches = matcher.match(self.features, features)
+            matches = matcher.match(photo_features, features)
         return self._solve(pose, render, image, matches)
 
     def track(self, pose: np.ndarray, blur: Blur | None = None) -> MatchedView:
@@ -134,7 +142,7 @@ class Query:
 
         The render is blurred by `blur`, as the photo is; None for a sharp one.
         """
-        tracker, render = self.tracker, self._render(pose)
+        tracker, render = self.tracker, self.render(pose)
         with self.clock.stage("track"):
             image = render.device_image()
             if blur is not None:
@@ -151,9 +159,18 @@ class Query:
         found = Correspondences(pixels[kept], lifted.points[kept], lifted.sigmas[kept])
         return at_middle_row(self.photo.camera, pose, found)
 
-    def _render(self, pose: np.ndarray) -> Render:
-        with self.clock.stage("render"):
-            return self.components.renderer.render(self.photo.camera, pose)
+    def render(self, pose: np.ndarray) -> Render:
+        """Render the map at a pose (4, 4), unless that is what was rendered last."""
+        last = self._last_render
+        if last.render is None or not np.array_equal(last.pose, pose):
+            with self.clock.stage("render"):
+                last.render = self.components.renderer.render(self.photo.camera, pose)
+            last.pose = pose.copy()
+        return last.render
+
+    @cached_property
+    def _last_render(self) -> _LastRender:
+        return _LastRender()
 
     def _solve(self, pose: np.ndarray, render: Render, image: Array, matches: Matches) -> MatchedView:
         options, camera = self.components.options, self.photo.camera

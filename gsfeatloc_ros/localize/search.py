@@ -12,15 +12,17 @@ import numpy as np
 from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.geometry import invert, moved, transform
 from gsfeatloc_ros.index.look_alikes import poses_elsewhere
+from gsfeatloc_ros.localize.content import MIN_FEATURES
 from gsfeatloc_ros.localize.evidence import Evidence
 from gsfeatloc_ros.localize.prior import Prior
 from gsfeatloc_ros.localize.query import MatchedView, Query
+from gsfeatloc_ros.localize.reach import is_worth_tracking
 from gsfeatloc_ros.localize.retrieval import Hint, retrieve
 from gsfeatloc_ros.match.base import Features
 
 # Matches that agree on a pose, by which a view suggests it. Chance makes some agree too: the map is looked at from the
 # pose of a hint that is not strong, and has to confirm it.
-MIN_HINT = 8
+MIN_HINT = MIN_FEATURES
 STRONG_HINT = 50
 CONFIRMED_HINT = 12
 # Views are matched with the photo at this width: it is cheap, and what it finds is refined afterwards.
@@ -37,6 +39,8 @@ _MAX_FOLLOWED_HINTS = 12
 _VIEWS_AFTER_INDEX = 8
 # Poses from which the same points are seen at least so many pixels apart are different places.
 _MIN_DISTANCE_OF_RIVALS = 40.0
+# Where the photo was tracked to from farther than this share of its width, it is tracked a second time.
+_MAX_TRACKED_OFFSET = 0.1
 # From a pose that is nearer to one that was refined tracking leads there again: pixels of a photo SEARCH_WIDTH wide.
 _MIN_DISTANCE_OF_TRIES = 10.0
 # Of the views that are looked at together, the best of this many are followed.
@@ -57,7 +61,7 @@ class Search:
 
     Attributes:
         best: the view that had most in common with the photo so far; None before one was rendered.
-        views: number of views that were rendered to find the photo.
+        views: number of views, other than the prior's, that were rendered to find the photo.
         searched: number of the index's views that were compared with it.
     """
 
@@ -65,6 +69,7 @@ class Search:
         self._small, self._prior, self._now = small, prior, now
         self.best: MatchedView | None = None
         self.views = self.searched = self._around = 0
+        self._at_prior = False
         self._pending: list[tuple[float, int, Hint]] = []
         self._tried: list[_Place] = []
 
@@ -76,21 +81,27 @@ class Search:
     def poses(self) -> Iterator[np.ndarray]:
         """Yield poses (4, 4) of the photo, as long as one is asked for and views are left."""
         if self._prior is not None:
-            yield from self._look([self._prior.pose])
+            yield from self._tracked(self._prior)
+        if len(self._small.features) < MIN_FEATURES:
+            return
+        tracked = len(self._tried)
+        if self._prior is not None:
+            yield from self._hints(look(self._small, [self._prior.pose]))
         if self._small.components.index is not None:
             yield from self._indexed()
         # Once a pose was refined, and is refused, others near the prior are no better.
-        if self._prior is not None and not self._tried:
+        if self._prior is not None and len(self._tried) == tracked:
             poses = self._spread(self._prior)
             for start in range(0, len(poses), _BATCH):
                 batch = poses[start : start + _BATCH]
                 self._around += len(batch)
-                yield from self._look(batch)
+                self.views += len(batch)
+                yield from self._hints(look(self._small, batch))
 
     @property
     def looked(self) -> str:
         """Where the photo was looked for, in words; empty for nowhere."""
-        views = ["at the prior"] if self._prior is not None and self.views else []
+        views = ["at the prior"] if self._at_prior else []
         if self._around:
             views.append(f"in {self._around} views around it")
         if self.searched:
@@ -99,8 +110,7 @@ class Search:
 
     def counted(self, evidence: Evidence) -> Evidence:
         """Return evidence with the numbers of views."""
-        views = max(self.views - (self._prior is not None), 0)
-        return replace(evidence, views=views, searched=self.searched, index_views=self._index_views)
+        return replace(evidence, views=self.views, searched=self.searched, index_views=self._index_views)
 
     @property
     def _index_views(self) -> int:
@@ -109,8 +119,8 @@ class Search:
 
     def rivals(self, found: MatchedView) -> Iterator[np.ndarray]:
         """Yield poses (4, 4), far from the one `found`, that explain the photo as well by the index and the prior."""
-        index, features, camera = self._small.components.index, self._small.features, self._small.photo.camera
-        if index is None or found.solution is None or not isinstance(features, Features):
+        index, camera = self._small.components.index, self._small.photo.camera
+        if index is None or found.solution is None:
             return
         place = _Place.of(found)
         places = [place]
@@ -118,7 +128,7 @@ class Search:
         if self.searched == 0:
             # It was found at the prior, and stands by it, unless the prior holds others for possible too.
             elsewhere = [pose for pose in elsewhere if self._likely(pose)]
-        else:
+        elif isinstance(features := self._small.features, Features):
             with self._small.clock.stage("search"):
                 elsewhere += poses_elsewhere(index, camera, features.on_host(), place.pose)
 
@@ -138,10 +148,21 @@ class Search:
         count = min(options.max_views, _VIEWS_AFTER_INDEX) if has_index else options.max_views
         return spread_poses(prior.pose, prior.covariance, min_step, count, options.seed)
 
-    def _look(self, poses: Sequence[np.ndarray]) -> Iterator[np.ndarray]:
-        """Render views and yield the poses that the best of them suggest."""
-        looked = look(self._small, poses)
-        self._saw(looked[0], len(looked))
+    def _tracked(self, prior: Prior) -> Iterator[np.ndarray]:
+        """Yield the pose to which the photo is tracked from the prior, where that is likely to be cheaper."""
+        camera, render = self._small.photo.camera, self._small.render(prior.pose)
+        self._at_prior = True
+        if not is_worth_tracking(render, camera, prior):
+            return
+        view = self._small.track(prior.pose)
+        if view.solution is not None and view.offset(camera) > _MAX_TRACKED_OFFSET * camera.width:
+            view = self._small.track(view.solution.T_map_camera)
+        if view.solution is not None and view.inliers >= CONFIRMED_HINT:
+            yield view.solution.T_map_camera
+
+    def _hints(self, looked: list[MatchedView]) -> Iterator[np.ndarray]:
+        """Yield the poses that the best of views suggest, which were looked at together and sorted."""
+        self._saw(looked[0])
         for hint in promising(looked):
             assert hint.solution is not None
             pose: np.ndarray | None = hint.solution.T_map_camera
@@ -192,11 +213,11 @@ class Search:
         if self._was_tried(pose):
             return None
         view = self._small.match(pose)
-        self._saw(view, 1)
+        self.views += 1
+        self._saw(view)
         return view.solution.T_map_camera if view.solution and view.inliers >= CONFIRMED_HINT else None
 
-    def _saw(self, view: MatchedView, count: int) -> None:
-        self.views += count
+    def _saw(self, view: MatchedView) -> None:
         if self.best is None or view.inliers > self.best.inliers:
             self.best = view
 

@@ -277,9 +277,14 @@ class _Linear(NamedTuple):
     by_point: np.ndarray
 
 
-def _linearize(camera: Camera, pose: np.ndarray, found: Correspondences) -> _Linear | None:
-    """Return the residuals at a pose (4, 4) and their Jacobians; None where a point is not ahead of the camera."""
-    offsets = found.points - pose[:3, 3]
+def project_with_jacobians(
+    camera: Camera, pose: np.ndarray, points: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """Return the pixels (M, 2) of points (M, 3) of the map, and their Jacobians by pose and point as of a _Linear.
+
+    None where a point is not ahead of the camera at the pose (4, 4).
+    """
+    offsets = points - pose[:3, 3]
     in_camera = offsets @ pose[:3, :3]
     z = in_camera[:, 2:]
     if not (z > 0).all():
@@ -291,6 +296,15 @@ def _linearize(camera: Camera, pose: np.ndarray, found: Correspondences) -> _Lin
     by_camera_point[:, :, 2] -= projected / z
     by_point = by_camera_point @ pose[:3, :3].T
     by_pose = np.concatenate([-by_point, by_point @ skew(offsets)], axis=2)
+    return projected, by_pose, by_point
+
+
+def _linearize(camera: Camera, pose: np.ndarray, found: Correspondences) -> _Linear | None:
+    """Return the residuals at a pose (4, 4) and their Jacobians; None where a point is not ahead of the camera."""
+    jacobians = project_with_jacobians(camera, pose, found.points)
+    if jacobians is None:
+        return None
+    projected, by_pose, by_point = jacobians
     return _Linear(projected - found.pixels, by_pose, by_point)
 
 

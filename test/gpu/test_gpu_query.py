@@ -101,7 +101,7 @@ def test_a_dark_photo_has_no_answer(gpu, renderer, room_camera, room_photos) -> 
         np.zeros_like(photo.image), room_camera, photo.T_map_camera_prior
     )
     assert estimate.status is Status.FAILED
-    assert "0 features in the photo" in estimate.reason
+    assert "0 corners in 0% of the photo" in estimate.reason
 
 
 def test_a_render_of_nothing_has_no_answer(gpu, room_map, room_camera, room_photos) -> None:

@@ -156,7 +156,7 @@ def test_image_that_cannot_be_decoded(client, localizer, good_info, good_prior, 
 
 def test_image_of_nothing(client, localizer, good_info, good_prior, photo):
     send_good_inputs(client, good_info, good_prior)
-    check_refusal(client, localizer, rgb_image(np.zeros_like(photo.image)), "0 features")
+    check_refusal(client, localizer, rgb_image(np.zeros_like(photo.image)), "0 corners")
     assert_answer(client, photo)
 
 

@@ -116,7 +116,7 @@ def test_a_photo_of_nothing_is_a_failure_with_a_reason(localizer, room_camera, r
     nothing = np.full((room_camera.height, room_camera.width, 3), value, np.uint8)
     estimate = localizer.localize(nothing, room_camera, room_photos[0].T_map_camera)
     assert_no_answer(estimate)
-    assert "0 features" in estimate.reason
+    assert "0 corners" in estimate.reason
 
 
 def _covered(image: np.ndarray, share: float, spots: int) -> np.ndarray:

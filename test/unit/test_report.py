@@ -119,7 +119,7 @@ def test_page_cites_the_published_figures_of_the_data_set(page):
 def test_worst_queries_are_shown_with_the_reason(page):
     text = " ".join(Page(page).text.split())
     assert "not answered 1.png (default sift, " in text
-    assert "Failed: 0 features in the photo" in text
+    assert "Failed: 0 corners in 0% of the photo" in text
     assert re.search(
         r"Prior off by [\d.]+° and [\d.]+ radii, from where \d+ % of what the photo shows is in view", text
     )
