@@ -11,47 +11,34 @@ from llvmlite import ir
 from numba import types
 
 from gsfeatloc_ros.render import base
+from gsfeatloc_ros.render.batch import BATCH_ROWS, BATCH_SIZE, BLOCKS, BLOCKS_X, DEPTH2, load_batch, record
+from gsfeatloc_ros.render.depth_sort import sorted_by_depth
 from gsfeatloc_ros.render.kernels import intrinsic, njit, prange
 from gsfeatloc_ros.render.lanes import (
     LANES,
+    SQUARE,
     broadcast,
     exp2,
     load,
     lowest_bit,
     mask_bits,
+    mask_from_bits,
     maximum,
     minimum,
+    minus_product,
     prefetch,
     select,
     sqrt,
     store,
+    store_rows,
+    store_square,
 )
-from gsfeatloc_ros.render.project import (
-    BLUE,
-    CONIC_X,
-    CONIC_Y,
-    DEPTH,
-    GREEN,
-    LEFT,
-    LOG_OPACITY,
-    RED,
-    SLANT,
-    SPLAT_SIZE,
-    TILE,
-    X,
-    Y,
-)
-
-# Lanes are blocks of 4 x 4 pixels: splats are round rather than long, and touch fewer of these than rows of 16.
-BLOCK_SIZE = 4
-_BLOCKS_X = TILE // BLOCK_SIZE
-_BLOCKS = _BLOCKS_X * _BLOCKS_X
-# Splats copied beside each other at a time, and then sifted by block: a bit for each.
-_BATCH_SIZE = 64
+from gsfeatloc_ros.render.project import BLUE, CONIC_X, CONIC_Y, DEPTH, GREEN, LOG_OPACITY, RED, SLANT, TILE, X, Y
 
 # State of a block's pixels. Depths count from the tile's nearest splat: the spread is a difference of squares.
-_TRANSMITTANCE, _COVERED, _RED, _GREEN, _BLUE, _MOMENT1, _MOMENT2, _MEDIAN = range(8)
-_STATE_SIZE = 8 * LANES
+_TRANSMITTANCE, _RED, _GREEN, _BLUE, _MOMENT1, _MOMENT2, _MEDIAN = range(7)
+_STATE_SIZE = 7 * LANES
+_ALL_LANES = np.uint32((1 << LANES) - 1)
 
 _F = np.float32
 # With an unsigned index numba does not look for negative ones.
@@ -59,14 +46,11 @@ _U = np.uint64
 _ZERO, _HALF, _ONE = _F(0), _F(0.5), _F(1)
 _LOG_MIN_ALPHA, _MAX_ALPHA = _F(math.log2(base.MIN_ALPHA)), _F(base.MAX_ALPHA)
 _MIN_TRANSMITTANCE, _DEPTH_MIN_ALPHA = (_F(base.MIN_TRANSMITTANCE), _F(base.DEPTH_MIN_ALPHA))
-# Less is as good as nothing, and CPUs are slow at numbers that are almost too small for float32.
-_TRANSMITTANCE_FLOOR = _F(1e-30)
 _NAN = _F(np.nan)
-_COLUMNS = np.tile(np.arange(BLOCK_SIZE, dtype=np.float32), BLOCK_SIZE)
-_ROWS = np.repeat(np.arange(BLOCK_SIZE, dtype=np.float32), BLOCK_SIZE)
-
-# Of a digit of the depth sort.
-_MAX_DIGIT_BITS = 9
+_COLUMNS = np.tile(np.arange(SQUARE, dtype=np.float32), SQUARE)
+_ROWS = np.repeat(np.arange(SQUARE, dtype=np.float32), SQUARE)
+# Records fetched ahead at each block, so that all of the next batch are after the last one.
+_AHEAD = BATCH_SIZE // BLOCKS
 
 
 @njit(nogil=True, cache=True)
@@ -126,183 +110,122 @@ def blend(splats, by_tile, starts, threads, background, rgb, depth, median_depth
 
     for _worker in prange(threads):
         spare = np.empty(longest, dtype=np.uint64)
-        state = np.empty(_BLOCKS * _STATE_SIZE, dtype=np.float32)
+        state = np.empty(BLOCKS * _STATE_SIZE, dtype=np.float32)
         while True:
             tile = _take_next(counter)
             if tile >= tiles:
                 break
-            keys = by_tile[starts[tile] : starts[tile + 1]]
-            keys = _sorted_by_depth(keys, spare)
+            keys = sorted_by_depth(by_tile[starts[tile] : starts[tile + 1]], spare)
             x0, y0 = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
-            nearest = splats[_record(keys[0]) + DEPTH] if len(keys) > 0 else _ZERO
+            nearest = splats[record(keys[0]) + DEPTH] if len(keys) > 0 else _ZERO
             _blend_tile(splats, keys, _F(x0), _F(y0), nearest, state)
             _finish_tile(state, x0, y0, nearest, background, rgb, depth, median_depth, depth_std, alpha)
 
 
 @njit
-def _record(key):
-    """Return where the record of the splat with this key is."""
-    return np.int64(key & np.uint64(0xFFFFFFFF)) * SPLAT_SIZE
-
-
-@njit
-def _sorted_by_depth(keys, spare):
-    """Sort the keys by their upper half, in place or into `spare`: a stable radix sort of the bits that differ."""
-    if len(keys) < 2:
-        return keys
-    shift = np.uint64(32)
-    low = high = keys[0] >> shift
-    for key in keys:
-        low, high = min(low, key >> shift), max(high, key >> shift)
-    bits = 0
-    while (high - low) >> np.uint64(bits):
-        bits += 1
-    digits = -(-bits // _MAX_DIGIT_BITS)
-    width = -(-bits // max(digits, 1))
-    mask = np.uint64((1 << width) - 1)
-    counts = np.empty(1 << width, dtype=np.int64)
-    a, b = keys, spare[: len(keys)]
-    for digit in range(digits):
-        down = np.uint64(digit * width)
-        counts[:] = 0
-        for key in a:
-            counts[((key >> shift) - low) >> down & mask] += 1
-        total = 0
-        for value in range(len(counts)):
-            count = counts[value]
-            counts[value] = total
-            total += count
-        for key in a:
-            value = ((key >> shift) - low) >> down & mask
-            b[counts[value]] = key
-            counts[value] += 1
-        a, b = b, a
-    return a
-
-
-@njit
 def _blend_tile(splats, keys, x0, y0, nearest, state):
-    """Blend splats, nearest first, into the state (_BLOCKS, _STATE_SIZE) of a tile whose first pixel is x0, y0."""
+    """Blend splats, nearest first, into the state (BLOCKS, _STATE_SIZE) of a tile whose first pixel is x0, y0."""
     state[:] = _ZERO
-    for block in range(_BLOCKS):
+    for block in range(BLOCKS):
         store(state, block * _STATE_SIZE + _TRANSMITTANCE * LANES, broadcast(_ONE))
-    batch = np.empty(_BATCH_SIZE * SPLAT_SIZE, dtype=np.float32)
-    members = np.empty(_BLOCKS, dtype=np.uint64)
-    running = np.ones(_BLOCKS, dtype=np.bool_)
-    for first in range(0, len(keys), _BATCH_SIZE):
-        count = min(_BATCH_SIZE, len(keys) - first)
-        # The records of the batch after this one come from memory while this one is blended.
-        for key in keys[first + _BATCH_SIZE : first + 2 * _BATCH_SIZE]:
-            prefetch(splats, _record(key))
-        for k in range(count):
-            store(batch, k * SPLAT_SIZE, load(splats, _record(keys[first + k])))
-        _find_members(batch, count, x0, y0, members)
+    starts = np.empty(BATCH_SIZE, dtype=np.int64)
+    batch = np.empty(BATCH_ROWS * BATCH_SIZE, dtype=np.float32)
+    members = np.empty(BLOCKS, dtype=np.uint64)
+    running = np.full(BLOCKS, _ALL_LANES)
+    for first in range(0, len(keys), BATCH_SIZE):
+        load_batch(splats, keys, first, x0, y0, nearest, starts, batch, members)
         any_running = False
-        for block in range(_BLOCKS):
+        for block in range(BLOCKS):
+            # The records of the next batch come from memory while this one is blended.
+            ahead = first + BATCH_SIZE + block * _AHEAD
+            for key in keys[ahead : ahead + _AHEAD]:
+                prefetch(splats, record(key))
             if running[block]:
-                x, y = x0 + _F(block % _BLOCKS_X * BLOCK_SIZE), y0 + _F(block // _BLOCKS_X * BLOCK_SIZE)
-                running[block] = _blend_block(batch, members[block], x, y, nearest, state, block * _STATE_SIZE)
-                any_running |= running[block]
+                x, y = x0 + _F(block % BLOCKS_X * SQUARE), y0 + _F(block // BLOCKS_X * SQUARE)
+                running[block] = _blend_block(batch, members[block], x, y, running[block], state, block * _STATE_SIZE)
+                any_running |= running[block] != 0
         if not any_running:
             break
 
 
 @njit
-def _find_members(batch, count, x0, y0, members):
-    """Set, for each block of the tile at x0, y0, a bit for each of the first `count` splats in `batch` that touch it.
-
-    Without a branch on what each splat touches: that cannot be predicted.
-    """
-    boxes = np.empty((4, _BATCH_SIZE), dtype=np.float32)
-    for k in range(_BATCH_SIZE):
-        at = _U(k) * _U(SPLAT_SIZE)
-        for side in range(4):
-            boxes[side, k] = batch[at + _U(LEFT + side)]
-    flat = boxes.reshape(-1)
-    columns, rows = np.zeros(_BLOCKS_X, dtype=np.uint64), np.zeros(_BLOCKS_X, dtype=np.uint64)
-    for group in range(0, _BATCH_SIZE, LANES):
-        left, right = load(flat, group), load(flat, _BATCH_SIZE + group)
-        top, bottom = load(flat, 2 * _BATCH_SIZE + group), load(flat, 3 * _BATCH_SIZE + group)
-        for i in range(_BLOCKS_X):
-            first, last = _F(i * BLOCK_SIZE), _F(i * BLOCK_SIZE + BLOCK_SIZE - 1)
-            in_column = mask_bits((left <= x0 + last) & (right >= x0 + first))
-            in_row = mask_bits((top <= y0 + last) & (bottom >= y0 + first))
-            columns[i] |= _U(in_column) << _U(group)
-            rows[i] |= _U(in_row) << _U(group)
-    among = _U(0xFFFFFFFFFFFFFFFF) >> _U(_BATCH_SIZE - count)
-    for block in range(_BLOCKS):
-        members[block] = columns[block % _BLOCKS_X] & rows[block // _BLOCKS_X] & among
-
-
-@njit
-def _blend_block(batch, members, x0, y0, nearest, state, at):
+def _blend_block(batch, members, x0, y0, running, state, at):
     """Blend the splats in `batch` that have a bit in `members` into a block of pixels.
 
-    The block's first pixel is x0, y0, and its state is at `at`. Return whether any of its rays goes on.
+    The block's first pixel is x0, y0, and its state is at `at`. `running` has a bit for each ray that goes on; return
+    those that still do.
     """
     columns, rows = load(_COLUMNS, 0) + x0, load(_ROWS, 0) + y0
-    transmittance = load(state, at + _TRANSMITTANCE * LANES)
-    covered = load(state, at + _COVERED * LANES)
-    red, green = load(state, at + _RED * LANES), load(state, at + _GREEN * LANES)
-    blue, median = load(state, at + _BLUE * LANES), load(state, at + _MEDIAN * LANES)
+    running = mask_from_bits(running)
+    transmittance, median = load(state, at + _TRANSMITTANCE * LANES), load(state, at + _MEDIAN * LANES)
+    red, green, blue = (
+        load(state, at + _RED * LANES),
+        load(state, at + _GREEN * LANES),
+        load(state, at + _BLUE * LANES),
+    )
     moment1, moment2 = load(state, at + _MOMENT1 * LANES), load(state, at + _MOMENT2 * LANES)
     while members:
-        k = _U(lowest_bit(members)) * _U(SPLAT_SIZE)
+        k = _U(lowest_bit(members))
         members &= members - _U(1)
-        dx, dy = columns - batch[k + _U(X)], rows - batch[k + _U(Y)]
-        dx = dx - dy * batch[k + _U(SLANT)]
-        log_alpha = dx * dx * batch[k + _U(CONIC_X)] + (dy * dy * batch[k + _U(CONIC_Y)] + batch[k + _U(LOG_OPACITY)])
+        dx, dy = columns - batch[k + _U(X * BATCH_SIZE)], rows - batch[k + _U(Y * BATCH_SIZE)]
+        dx = dx - dy * batch[k + _U(SLANT * BATCH_SIZE)]
+        log_alpha = dx * dx * batch[k + _U(CONIC_X * BATCH_SIZE)] + (
+            dy * dy * batch[k + _U(CONIC_Y * BATCH_SIZE)] + batch[k + _U(LOG_OPACITY * BATCH_SIZE)]
+        )
         alpha = select(log_alpha >= _LOG_MIN_ALPHA, minimum(exp2(log_alpha), _MAX_ALPHA), _ZERO)
-        after = transmittance * (_ONE - alpha)
-        # It only falls: a ray that has ended remains so.
-        weight = select(after > _MIN_TRANSMITTANCE, transmittance * alpha, _ZERO)
-        z = batch[k + _U(DEPTH)] - nearest
-        median = select((transmittance > _HALF) & (after <= _HALF), z, median)
-        transmittance = maximum(after, _TRANSMITTANCE_FLOOR)
-        covered = covered + weight
-        red = red + weight * batch[k + _U(RED)]
-        green = green + weight * batch[k + _U(GREEN)]
-        blue = blue + weight * batch[k + _U(BLUE)]
-        moment1 = moment1 + weight * z
-        moment2 = moment2 + weight * z * z
+        weight = transmittance * alpha
+        after = minus_product(transmittance, transmittance, alpha)
+        running = running & (after > _MIN_TRANSMITTANCE)
+        # At last that of the splat at which the transmittance falls to a half.
+        median = select(transmittance > _HALF, batch[k + _U(DEPTH * BATCH_SIZE)], median)
+        transmittance = select(running, after, transmittance)
+        red = select(running, red + weight * batch[k + _U(RED * BATCH_SIZE)], red)
+        green = select(running, green + weight * batch[k + _U(GREEN * BATCH_SIZE)], green)
+        blue = select(running, blue + weight * batch[k + _U(BLUE * BATCH_SIZE)], blue)
+        moment1 = select(running, moment1 + weight * batch[k + _U(DEPTH * BATCH_SIZE)], moment1)
+        moment2 = select(running, moment2 + weight * batch[k + _U(DEPTH2 * BATCH_SIZE)], moment2)
     store(state, at + _TRANSMITTANCE * LANES, transmittance)
-    store(state, at + _COVERED * LANES, covered)
+    store(state, at + _MEDIAN * LANES, median)
     store(state, at + _RED * LANES, red)
     store(state, at + _GREEN * LANES, green)
     store(state, at + _BLUE * LANES, blue)
     store(state, at + _MOMENT1 * LANES, moment1)
     store(state, at + _MOMENT2 * LANES, moment2)
-    store(state, at + _MEDIAN * LANES, median)
-    return mask_bits(transmittance > _MIN_TRANSMITTANCE) != 0
+    return mask_bits(running)
 
 
 @njit
 def _finish_tile(state, x0, y0, nearest, background, rgb, depth, median_depth, depth_std, alpha):
     """Write a tile's state to the images."""
     height, width = depth.shape
-    for block in range(_BLOCKS):
+    for block in range(BLOCKS):
         at = block * _STATE_SIZE
-        covered = minimum(load(state, at + _COVERED * LANES), _ONE)
-        store(state, at + _COVERED * LANES, covered)
-        uncovered = _ONE - covered
-        for channel in range(3):
-            color = load(state, at + (_RED + channel) * LANES) + uncovered * background[channel]
-            store(state, at + (_RED + channel) * LANES, minimum(color, _ONE))
+        uncovered = load(state, at + _TRANSMITTANCE * LANES)
+        covered = _ONE - uncovered
+        red = minimum(load(state, at + _RED * LANES) + uncovered * background[0], _ONE)
+        green = minimum(load(state, at + _GREEN * LANES) + uncovered * background[1], _ONE)
+        blue = minimum(load(state, at + _BLUE * LANES) + uncovered * background[2], _ONE)
         has_depth = covered >= _DEPTH_MIN_ALPHA
         mean = load(state, at + _MOMENT1 * LANES) / covered
         variance = load(state, at + _MOMENT2 * LANES) / covered - mean * mean
-        median = load(state, at + _MEDIAN * LANES)
-        store(state, at + _MOMENT1 * LANES, select(has_depth, mean + nearest, _NAN))
-        store(state, at + _MOMENT2 * LANES, select(has_depth, sqrt(maximum(variance, _ZERO)), _NAN))
-        store(state, at + _MEDIAN * LANES, select(has_depth, median + nearest, _NAN))
-        left, top = x0 + block % _BLOCKS_X * BLOCK_SIZE, y0 + block // _BLOCKS_X * BLOCK_SIZE
-        for y in range(top, min(top + BLOCK_SIZE, height)):
-            for x in range(left, min(left + BLOCK_SIZE, width)):
-                pixel = at + (y - top) * BLOCK_SIZE + x - left
-                alpha[y, x] = state[pixel + _COVERED * LANES]
-                rgb[y, x, 0] = state[pixel + _RED * LANES]
-                rgb[y, x, 1] = state[pixel + _GREEN * LANES]
-                rgb[y, x, 2] = state[pixel + _BLUE * LANES]
-                depth[y, x] = state[pixel + _MOMENT1 * LANES]
-                depth_std[y, x] = state[pixel + _MOMENT2 * LANES]
-                median_depth[y, x] = state[pixel + _MEDIAN * LANES]
+        spread = select(has_depth, sqrt(maximum(variance, _ZERO)), _NAN)
+        median = select(has_depth, load(state, at + _MEDIAN * LANES) + nearest, _NAN)
+        mean = select(has_depth, mean + nearest, _NAN)
+        left, top = x0 + block % BLOCKS_X * SQUARE, y0 + block // BLOCKS_X * SQUARE
+        if left + SQUARE <= width and top + SQUARE <= height:
+            place = top * width + left
+            store_square(rgb, 3 * place, 3 * width, (red, green, blue))
+            store_square(depth, place, width, (mean,))
+            store_square(median_depth, place, width, (median,))
+            store_square(depth_std, place, width, (spread,))
+            store_square(alpha, place, width, (covered,))
+            continue
+        # At the images' right or lower border, or beyond.
+        store_rows(state, at, LANES, (red, green, blue, mean, median, spread, covered))
+        for y in range(top, min(top + SQUARE, height)):
+            for x in range(left, min(left + SQUARE, width)):
+                pixel = at + (y - top) * SQUARE + x - left
+                for channel in range(3):
+                    rgb[y, x, channel] = state[pixel + channel * LANES]
+                depth[y, x], median_depth[y, x] = state[pixel + 3 * LANES], state[pixel + 4 * LANES]
+                depth_std[y, x], alpha[y, x] = state[pixel + 5 * LANES], state[pixel + 6 * LANES]

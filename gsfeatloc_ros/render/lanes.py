@@ -19,6 +19,8 @@ from numba.extending import lower_builtin, models, register_model
 from gsfeatloc_ros.render.kernels import intrinsic, njit
 
 LANES = 16
+# Lanes as a square of pixels.
+SQUARE = 4
 
 _FLOATS = ir.VectorType(ir.FloatType(), LANES)
 _DOUBLES = ir.VectorType(ir.DoubleType(), LANES)
@@ -204,6 +206,20 @@ def store(typingctx, array, index, values):
 
 
 @intrinsic
+def store_rows(typingctx, array, index, stride, rows):
+    """Do `store` with each of a tuple of Lanes, `stride` elements further on each time."""
+
+    def codegen(context, builder, sig, args):
+        data, place = _data(context, builder, sig.args[0], args[0]), args[1]
+        for row in range(sig.args[3].count):
+            builder.store(builder.extract_value(args[3], row), _vector_at(builder, data, place, _FLOATS), align=4)
+            place = builder.add(place, args[2])
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, types.intp, rows), codegen
+
+
+@intrinsic
 def store_columns(typingctx, array, index, mask, rows):
     """Store columns of a square matrix, those in the mask, one behind another from array[index] on.
 
@@ -243,6 +259,63 @@ def _transposed(builder, rows: list) -> list:
 
 
 @intrinsic
+def load_columns(typingctx, array, starts, first):
+    """Return a tuple of LANES Lanes: i holds array[start + i] for each start in starts[first : first + LANES].
+
+    Both are flat and contiguous, `array` is float32 and `starts` int64; no end is checked.
+    """
+
+    def codegen(context, builder, sig, args):
+        array_type, starts_type, _ = sig.args
+        data, places = _data(context, builder, array_type, args[0]), _data(context, builder, starts_type, args[1])
+        rows = []
+        for lane in range(LANES):
+            place = builder.gep(places, [builder.add(args[2], ir.Constant(args[2].type, lane))])
+            rows.append(builder.load(_vector_at(builder, data, builder.load(place), _FLOATS), align=4))
+        return context.make_tuple(builder, sig.return_type, _transposed(builder, rows))
+
+    return types.UniTuple(_LANES, LANES)(array, starts, types.intp), codegen
+
+
+@intrinsic
+def store_square(typingctx, picture, place, stride, channels):
+    """Write a square of SQUARE x SQUARE pixels into a picture, row by row; no end is checked.
+
+    Args:
+        picture: contiguous float32, the channels of a pixel beside each other.
+        place: index of the first channel of the square's first pixel.
+        stride: from a row of the picture to the next.
+        channels: tuple of Lanes, the pixels' values of each channel.
+    """
+
+    def codegen(context, builder, sig, args):
+        data = _data(context, builder, sig.args[0], args[0])
+        values = [builder.extract_value(args[3], channel) for channel in range(sig.args[3].count)]
+        place = args[1]
+        for row in range(SQUARE):
+            pixels = _interleaved(builder, values, row)
+            builder.store(pixels, _vector_at(builder, data, place, pixels.type), align=4)
+            place = builder.add(place, args[2])
+        return context.get_dummy_value()
+
+    return types.void(picture, types.intp, types.intp, channels), codegen
+
+
+def _interleaved(builder, channels: list, row: int):
+    """Return a row of a square, a pixel's channels beside each other, as one vector."""
+    count = len(channels)
+    size = SQUARE * count
+    mask_type = ir.VectorType(ir.IntType(32), size)
+    pixels = None
+    for channel, values in enumerate(channels):
+        spread = ir.Constant(mask_type, [SQUARE * row + place // count for place in range(size)])
+        own = builder.shuffle_vector(values, values, spread)
+        taken = ir.Constant(mask_type, [place + size * (place % count == channel) for place in range(size)])
+        pixels = own if pixels is None else builder.shuffle_vector(pixels, own, taken)
+    return pixels
+
+
+@intrinsic
 def select(typingctx, mask, a, b):
     """Return `a` in the lanes of the mask, `b` in the others; either may be a number."""
 
@@ -261,6 +334,16 @@ def mask_bits(typingctx, mask):
         return builder.zext(builder.bitcast(args[0], ir.IntType(LANES)), ir.IntType(32))
 
     return types.uint32(_MASK), codegen
+
+
+@intrinsic
+def mask_from_bits(typingctx, bits):
+    """Return the mask whose lane i is bit i of a number."""
+
+    def codegen(context, builder, sig, args):
+        return builder.bitcast(builder.trunc(args[0], ir.IntType(LANES)), _BITS)
+
+    return _MASK(types.uint32), codegen
 
 
 @intrinsic
@@ -297,7 +380,20 @@ def _unary(name: str):
     return intrinsic(typer)
 
 
-sqrt, floor, log2 = _unary("llvm.sqrt"), _unary("llvm.floor"), _unary("llvm.log2")
+sqrt, floor, log2, absolute = (_unary(f"llvm.{name}") for name in ("sqrt", "floor", "log2", "fabs"))
+
+
+@intrinsic
+def minus_product(typingctx, a, b, c):
+    """Return a - b c, in one instruction where there is one for it, although b c is needed elsewhere too."""
+
+    def codegen(context, builder, sig, args):
+        a, b, c = args
+        function_type = ir.FunctionType(_FLOATS, [_FLOATS] * 3)
+        function = cgutils.get_or_insert_function(builder.module, function_type, f"llvm.fmuladd.v{LANES}f32")
+        return builder.call(function, [builder.fneg(b), c, a])
+
+    return _LANES(_LANES, _LANES, _LANES), codegen
 
 
 @njit
@@ -313,24 +409,27 @@ def maximum(a, b):
 
 
 @intrinsic
-def _times_power_of_two(typingctx, values, exponents):
-    """Return values 2^exponents, for values in [1, 2) and whole exponents in [-126, 127]."""
+def _times_power_of_two(typingctx, values, shifted):
+    """Return values 2^n, where `shifted` is _TO_WHOLE + n, n from -126 to 127."""
 
     def codegen(context, builder, sig, args):
-        shift = builder.shl(builder.fptosi(args[1], _INTS), ir.Constant(_INTS, [23] * LANES))
-        return builder.bitcast(builder.add(builder.bitcast(args[0], _INTS), shift), _FLOATS)
+        # The lowest bits of `shifted` are n; all others are shifted out.
+        exponent = builder.shl(builder.bitcast(args[1], _INTS), ir.Constant(_INTS, [23] * LANES))
+        return builder.bitcast(builder.add(builder.bitcast(args[0], _INTS), exponent), _FLOATS)
 
     return _LANES(_LANES, _LANES), codegen
 
 
-# 2^f on [0, 1): minimax polynomial of degree 4, relative error 2.6e-6.
-_P0, _P1, _P2 = (np.float32(1.00000259), np.float32(6.93003835e-1), np.float32(2.41442756e-1))
-_P3, _P4 = np.float32(5.20114611e-2), np.float32(1.3534168e-2)
+# Added to a number up to 2^22, what comes out has no bits left for less than 1: that rounds it.
+_TO_WHOLE = np.float32(1.5 * 2**23)
+# 2^f on [-0.5, 0.5]: minimax polynomial of degree 4, relative error 2.6e-6.
+_P0, _P1, _P2 = (np.float32(0.99999928), np.float32(0.69312179), np.float32(0.24024744))
+_P3, _P4 = np.float32(0.055917859), np.float32(0.0095701021)
 
 
 @njit
 def exp2(x):
-    """Return 2^x to a relative 3e-6, for x from -126 to below 128; anything for others."""
-    whole = floor(x)
-    f = x - whole
-    return _times_power_of_two(_P0 + f * (_P1 + f * (_P2 + f * (_P3 + f * _P4))), whole)
+    """Return 2^x to a relative 3e-6, for x from -126 to 127; anything for others."""
+    shifted = x + _TO_WHOLE
+    f = x - (shifted - _TO_WHOLE)
+    return _times_power_of_two(_P0 + f * (_P1 + f * (_P2 + f * (_P3 + f * _P4))), shifted)
