@@ -6,6 +6,7 @@ Pixels follow OpenCV and sensor_msgs/CameraInfo: the centre of the top-left pixe
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -123,21 +124,16 @@ class Camera:
         """Return the image (H, W, C) of `pinhole()`; it is black where the lens saw nothing."""
         if not self.distorted:
             return image
-        if self._skew != 0:
-            return self._undistort_skewed(image)
-        if self.model == "equidistant":
-            return cv2.fisheye.undistortImage(image, self.K, self._fisheye_coefficients, Knew=self.K)
-        return cv2.undistort(image, self.K, self.distortion)
-
-    def _undistort_skewed(self, image: np.ndarray) -> np.ndarray:
-        """Do as `undistort_image`, for a K with skew, which OpenCV knows nothing of."""
-        K, size = self._K_pinhole, (self.width, self.height)
-        if self.model == "equidistant":
-            x, y = cv2.fisheye.initUndistortRectifyMap(K, self._fisheye_coefficients, np.eye(3), K, size, cv2.CV_32FC1)
-        else:
-            x, y = cv2.initUndistortRectifyMap(K, self.distortion, None, K, size, cv2.CV_32FC1)
-        x += (self._skew / K[1, 1]) * (y - K[1, 2])
+        x, y, _ = self._undistortion
         return cv2.remap(image, x, y, cv2.INTER_LINEAR)
+
+    def seen(self) -> np.ndarray:
+        """Return where (H, W) bool the lens saw something of what `pinhole()` sees; not to be written to."""
+        return self._undistortion[2] if self.distorted else np.ones((self.height, self.width), bool)
+
+    @property
+    def _undistortion(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        return _undistortion(self.width, self.height, self.K.tobytes(), self.distortion.tobytes(), self.model)
 
     @property
     def _skew(self) -> float:
@@ -161,3 +157,27 @@ class Camera:
         """Return the camera-frame directions (N, 3) with z = 1 through undistorted pixels (N, 2)."""
         homogeneous = np.column_stack([pixels, np.ones(len(pixels))])
         return homogeneous @ np.linalg.inv(self._K_pinhole).T
+
+
+@lru_cache(maxsize=4)
+def _undistortion(
+    width: int, height: int, K: bytes, distortion: bytes, model: str
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the maps (H, W, ...) by which cv2.remap undistorts images of a camera, and where (H, W) bool it saw these.
+
+    All images of a stream have the same: they are computed once.
+    """
+    camera = Camera(width, height, np.frombuffer(K), np.frombuffer(distortion), model)
+    pinhole, size = camera._K_pinhole, (width, height)
+    # OpenCV knows nothing of a skew: what it does not have to know of is in fixed point, which is faster.
+    kind = cv2.CV_16SC2 if camera._skew == 0 else cv2.CV_32FC1
+    if model == "equidistant":
+        coefficients = camera._fisheye_coefficients
+        x, y = cv2.fisheye.initUndistortRectifyMap(pinhole, coefficients, np.eye(3), pinhole, size, kind)
+    else:
+        x, y = cv2.initUndistortRectifyMap(pinhole, camera.distortion, None, pinhole, size, kind)
+    if camera._skew != 0:
+        x += (camera._skew / pinhole[1, 1]) * (y - pinhole[1, 2])
+    seen = cv2.remap(np.full((height, width), 255, np.uint8), x, y, cv2.INTER_LINEAR) == 255
+    seen.flags.writeable = False
+    return x, y, seen

@@ -39,8 +39,7 @@ class Photo:
         if larger.width >= _MIN_ENLARGEMENT * camera.width:
             image = cv2.resize(image, (larger.width, larger.height), interpolation=cv2.INTER_CUBIC)
             camera = larger
-        seen = camera.undistort_image(np.full(image.shape[:2], 255, np.uint8)) == 255
-        return Photo(camera.undistort_image(image), seen, camera.pinhole())
+        return Photo(camera.undistort_image(image), camera.seen(), camera.pinhole())
 
     def limited(self, max_width: int) -> Photo:
         """Return the same at most `max_width` pixels wide."""

@@ -112,7 +112,7 @@ def _psnr(scene: Scene, photos: Sequence[PosedPhoto], renderer: Renderer, max_wi
     found = []
     for photo in photos:
         image, camera = photo.camera.limit(scene.read_photo(photo), max_width)
-        inside = camera.undistort_image(np.full(image.shape[:2], 255, np.uint8)) == 255
+        inside = camera.seen()
         seen = camera.undistort_image(image)[inside] / 255.0
         drawn = to_host(renderer.render(camera.pinhole(), photo.T_map_camera).rgb)[inside]
         found.append(aligned_psnr(seen, drawn))

@@ -106,6 +106,25 @@ def test_skew_is_undistorted_with_the_lens(model, coefficients, skew):
 
 
 @pytest.mark.parametrize(("model", "coefficients"), LENSES)
+def test_pictures_are_undistorted_as_by_opencv(model, coefficients):
+    camera, D = Camera(640, 480, K, np.array(coefficients), model), np.array(coefficients, np.float64)
+    image = np.random.default_rng(0).integers(0, 256, (480, 640, 3), np.uint8)
+    everywhere = np.full((480, 640), 255, np.uint8)
+    for picture, ours in ((image, camera.undistort_image(image)), (everywhere, 255 * camera.seen().astype(np.uint8))):
+        if model == "equidistant":
+            expected = cv2.fisheye.undistortImage(picture, K, D, Knew=K)
+        else:
+            expected = cv2.undistort(picture, K, D)
+        if picture is everywhere:
+            expected[expected < 255] = 0
+        np.testing.assert_array_equal(ours, expected)
+
+
+def test_a_pinhole_camera_sees_everywhere():
+    assert Camera(64, 48, K).seen().all()
+
+
+@pytest.mark.parametrize(("model", "coefficients"), LENSES)
 def test_undistort_of_no_pixels(model, coefficients):
     assert Camera(640, 480, K, np.array(coefficients), model).undistort(np.zeros((0, 2))).shape == (0, 2)
 
