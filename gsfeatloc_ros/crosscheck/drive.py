@@ -18,6 +18,8 @@ _FLOOR = (1e-3, 1e-3)
 # Places in a vector of corrections (8,).
 SCALE, DELAY, LEVER, ROTATION = slice(0, 1), slice(1, 2), slice(2, 5), slice(5, 8)
 CORRECTIONS = 8
+# Diagonals of the residuals' covariance, from the main one downwards, that are not zero: legs share the answer between.
+_BAND = 12
 # Of the difference quotients.
 _STEP = 1e-5
 
@@ -60,7 +62,7 @@ class Drive:
         self._middle = odometry[:, len(OFFSETS) // 2, :3, :3]
         turns = np.swapaxes(self._middle, 1, 2)[:, None] @ odometry[:, :, :3, :3]
         self._turns = Rotation.from_matrix(turns.reshape(-1, 3, 3)).as_rotvec().reshape(*turns.shape[:2], 3)
-        self.answer_covariance = self._answer_covariance([keyframe.covariance for keyframe in keyframes])
+        self._answer_band = _band(self._answer_covariance([keyframe.covariance for keyframe in keyframes]))
 
     def residuals(self, corrections: np.ndarray) -> np.ndarray:
         """Return by how much the legs of answers are off from those of the odometry with these corrections.
@@ -81,10 +83,10 @@ class Drive:
         """Return the derivatives (6 legs, columns) of the residuals by some of the corrections."""
         ends = [corrections + sign * _STEP * np.eye(CORRECTIONS)[columns] for sign in (1.0, -1.0)]
         up, down = (np.array([self.residuals(end) for end in side]) for side in ends)
-        return (up - down).reshape(len(columns), len(self.answer_covariance)).T / (2.0 * _STEP)
+        return (up - down).reshape(len(columns), self._answer_band.shape[1]).T / (2.0 * _STEP)
 
     def covariance(self, noise: float) -> np.ndarray:
-        """Return the covariance (6 legs, 6 legs) of the residuals where all is right.
+        """Return the covariance of the residuals where all is right, as a band (_BAND, 6 legs): see `_band`.
 
         Args:
             noise: share of the way, and of the turn, by which odometry is off on a leg (standard deviation).
@@ -93,7 +95,9 @@ class Drive:
         turn = np.linalg.norm(Rotation.from_matrix(_turns(self._middle)).as_rotvec(), axis=1)
         swing = turn * np.linalg.norm(self._levers[:-1], axis=1)
         sigmas = np.column_stack([np.hypot(_FLOOR[0], noise * (way + swing)), np.hypot(_FLOOR[1], noise * turn)])
-        return self.answer_covariance + np.diag(np.repeat(sigmas**2, 3, axis=1).ravel())
+        band = self._answer_band.copy()
+        band[0] += np.repeat(sigmas**2, 3, axis=1).ravel()
+        return band
 
     def _body_at(self, offset: float) -> tuple[np.ndarray, np.ndarray]:
         """Return positions (n, 3) and rotations (n, 3, 3) of the body so many seconds after the stamps."""
@@ -123,6 +127,11 @@ class Drive:
             effect[row + 3 : row + 6, start + 3 : start + 6] = -into_next[leg]
             effect[row + 3 : row + 6, end + 3 : end + 6] = into_next[leg]
         return effect @ block_diag(*covariances) @ effect.T
+
+
+def _band(matrix: np.ndarray) -> np.ndarray:
+    """Return up to _BAND diagonals (_BAND, n) of a matrix (n, n), the main one first, as LAPACK has band matrices."""
+    return np.array([np.pad(matrix.diagonal(-below), (0, below)) for below in range(min(_BAND, len(matrix)))])
 
 
 def _applied(matrices: np.ndarray, vectors: np.ndarray) -> np.ndarray:

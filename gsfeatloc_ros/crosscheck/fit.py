@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
-from scipy.linalg import solve_triangular
+from scipy.linalg import cholesky_banded
+from scipy.linalg.lapack import dtbtrs
 
 from gsfeatloc_ros.crosscheck.drive import CORRECTIONS, DELAY, LEVER, ROTATION, SCALE, Drive
 
@@ -94,7 +95,7 @@ def explain(drive: Drive) -> Fit:
     The causes are compared by Bayesian evidence in the manner of Laplace (MacKay, Information Theory, Inference, and
     Learning Algorithms, 2003, chapter 28): one that the motion does not tell of explains nothing, and is not chosen.
     """
-    roots = [np.linalg.cholesky(drive.covariance(noise)) for noise in _NOISES]
+    roots = [cholesky_banded(drive.covariance(noise), lower=True) for noise in _NOISES]
     right = _fit(drive, None, roots)
     fits = sorted((_fit(drive, cause, roots) for cause in Cause), key=lambda fit: fit.log_evidence)
     best, second = fits[-1], fits[-2]
@@ -108,7 +109,7 @@ def explain(drive: Drive) -> Fit:
 
 
 def _fit(drive: Drive, cause: Cause | None, roots: list[np.ndarray]) -> Fit:
-    """Fit the correction of a cause; `roots` are the Cholesky factors of the residuals' covariance for each noise."""
+    """Fit the correction of a cause; `roots` as of _solve, for each noise."""
     columns = np.arange(CORRECTIONS)[cause.place] if cause else np.arange(0)
     precision = np.eye(len(columns)) / (cause.usual**2 if cause else 1.0)
     value, likely = np.zeros(len(columns)), range(len(roots))
@@ -134,14 +135,14 @@ def _solve(
         system: (m, 1 + n) residuals, and their derivatives, at `start`.
         start: (n,) value.
         precision: (n, n) inverse covariance of the value before anything is known; its mean is 0.
-        root: (m, m) Cholesky factor of the residuals' covariance.
+        root: band (diagonals, m) of the Cholesky factor of the residuals' covariance, the main diagonal first.
     """
-    white = solve_triangular(root, system, lower=True, check_finite=False)
+    white, _ = dtbtrs(root, system, uplo="L")
     residuals, derivatives = white[:, 0] - white[:, 1:] @ start, white[:, 1:]
     information = derivatives.T @ derivatives + precision
     covariance = np.linalg.inv(information)
     value = -covariance @ derivatives.T @ residuals
     square = np.sum((residuals + derivatives @ value) ** 2) + value @ precision @ value
     spread = np.linalg.slogdet(information)[1] - np.linalg.slogdet(precision)[1]
-    log_evidence = -0.5 * (square + spread) - np.log(np.diag(root)).sum()
+    log_evidence = -0.5 * (square + spread) - np.log(root[0]).sum()
     return value, covariance, float(log_evidence)

@@ -16,9 +16,10 @@ from gsfeatloc_ros.ros_io.decode import frame_name, nanoseconds
 from gsfeatloc_ros.ros_io.inputs import Inputs
 from gsfeatloc_ros.ros_io.message_types import Header
 
-# Answers that count, the newest; and how many new ones there are between two looks at them.
+# Answers that count, the newest; and how many new ones there are between two looks at them, which take as long as half
+# an answer: fewer looks where all answers that count agree.
 _MAX_KEYFRAMES = 40
-_BETWEEN_LOOKS = 5
+_BETWEEN_LOOKS, _BETWEEN_LOOKS_IN_PEACE = 5, 20
 # An answer counts where the body has moved by so many metres, or turned by so many degrees, since the last that did.
 _MIN_MOTION = (0.1, 5.0)
 # Where an answer is off by more metres, and times the way, or by more degrees, the robot was carried, or its odometry
@@ -120,7 +121,9 @@ class CrossCheck:
                 self._body = self._inputs.odometry_body
             self._waiting.append(_Answer(stamp, T_map_camera, covariance, T_body_camera))
             self._take_waiting()
-            if self._unseen < _BETWEEN_LOOKS or len(self._keyframes) < max(self._options.answers, 3):
+            in_peace = self.cause is None and len(self._keyframes) == _MAX_KEYFRAMES
+            between_looks = _BETWEEN_LOOKS_IN_PEACE if in_peace else _BETWEEN_LOOKS
+            if self._unseen < between_looks or len(self._keyframes) < max(self._options.answers, 3):
                 return
             self._unseen = 0
             drive = Drive(self._keyframes)

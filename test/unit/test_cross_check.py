@@ -123,3 +123,13 @@ def test_a_robot_that_is_carried_begins_anew():
     robot.drive(planar, 15)
     robot.drive(lambda time: make_pose(np.eye(3), [9.0, 0.0, 0.0]) @ planar(time), 1)
     assert robot.check.warning == ""
+
+
+def test_what_goes_wrong_later_is_found_as_well():
+    robot = Robot()
+    robot.drive(planar, 45)
+    assert robot.check.warning == ""
+    robot.drive(planar, 40, delay=0.08)
+    assert robot.check.cause is Cause.DELAY
+    robot.drive(planar, 50)
+    assert robot.check.warning == ""
