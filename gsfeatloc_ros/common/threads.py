@@ -1,9 +1,16 @@
-"""The threads that compute: how many, and how they wait for each other."""
+"""The threads that compute: how many, how they wait for each other, and on how many cores."""
 
 from __future__ import annotations
 
 import os
 import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+# By how much threads in the background are nicer: three quarters of a core are left to one that works all the time.
+_NICENESS = 5
 
 
 def wait_passively() -> None:
@@ -35,3 +42,84 @@ def limit_threads(count: int) -> None:
         sys.modules["numba"].config.reload_config()
     if "torch" in sys.modules:
         sys.modules["torch"].set_num_threads(count)
+
+
+class Cores:
+    """Keeps this process to as many cores as it may compute in threads, while something works beside what it does.
+
+    What one call computes keeps to its threads, but a thread in the background takes another core. While there is one,
+    all threads run on the same cores, and the kernel shares these out; else they are left to it, which finds the cores
+    that are free.
+
+    Args:
+        count: of cores; 0 for all.
+    """
+
+    def __init__(self, count: int) -> None:
+        self._count = count
+        self._lock = threading.Lock()
+        self._users = 0
+        self._before: dict[int, set[int]] = {}
+
+    @contextmanager
+    def in_background(self) -> Iterator[None]:
+        """Work in this thread, and in those that it starts, beside the others: they go first, on the same cores."""
+        thread = threading.get_native_id()
+        os.setpriority(os.PRIO_PROCESS, thread, os.getpriority(os.PRIO_PROCESS, thread) + _NICENESS)
+        with self._lock:
+            self._users += 1
+            if self._users == 1:
+                self._share()
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._users -= 1
+                if not self._users:
+                    self._part()
+
+    def _share(self) -> None:
+        allowed = os.sched_getaffinity(0)
+        if not 0 < self._count < len(allowed):
+            return
+        # Those on which the threads are that have worked most: where cores differ, the kernel has found the fast ones.
+        busiest = sorted(map(_work_and_core, _threads()), reverse=True)
+        cores = list(dict.fromkeys([core for _, core in busiest if core in allowed] + sorted(allowed)))
+        self._before = {thread: _allowed(thread) for thread in _threads()}
+        for thread in _threads():
+            _allow(thread, set(cores[: self._count]))
+
+    def _part(self) -> None:
+        if self._before:
+            everywhere = set[int]().union(*self._before.values())
+            for thread in _threads():
+                _allow(thread, self._before.get(thread, everywhere))
+        self._before = {}
+
+
+def _threads() -> list[int]:
+    """Return the ids of this process's threads."""
+    return [int(name) for name in os.listdir("/proc/self/task")]
+
+
+def _work_and_core(thread: int) -> tuple[int, int]:
+    """Return for how many ticks a thread has worked, and the core on which it was last; zeros if it has ended."""
+    try:
+        fields = Path(f"/proc/self/task/{thread}/stat").read_text().rsplit(")", 1)[1].split()
+    except OSError:
+        return 0, 0
+    return int(fields[11]) + int(fields[12]), int(fields[36])
+
+
+def _allowed(thread: int) -> set[int]:
+    """Return the cores on which a thread may run; none if it has ended."""
+    try:
+        return os.sched_getaffinity(thread)
+    except OSError:
+        return set()
+
+
+def _allow(thread: int, cores: set[int]) -> None:
+    """Let a thread run on these cores; it may have ended, or the machine may not allow it."""
+    with suppress(OSError):
+        os.sched_setaffinity(thread, cores)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 
+from gsfeatloc_ros.common.threads import Cores
 from gsfeatloc_ros.localize.engine import Engine
 from gsfeatloc_ros.localize.map_index import index_for, index_key
 from gsfeatloc_ros.node.attempts import Attempts
@@ -21,10 +22,11 @@ class IndexBuild:
     Args:
         attempts: that are to use it.
         reporter: writes to the log and to /diagnostics.
+        cores: on which it is made, beside the attempts.
     """
 
-    def __init__(self, attempts: Attempts, reporter: Reporter) -> None:
-        self._attempts, self._reporter = attempts, reporter
+    def __init__(self, attempts: Attempts, reporter: Reporter, cores: Cores) -> None:
+        self._attempts, self._reporter, self._cores = attempts, reporter, cores
         self._cancelled = threading.Event()
         self._thread: threading.Thread | None = None
 
@@ -60,8 +62,9 @@ class IndexBuild:
                 self._say(OK, f"building the view index: {done} of {total} views", engine, done)
 
         try:
-            key = index_key(engine.map_path, settings.map, settings.matcher)
-            index = index_for(engine, settings.index, key, progress, cancelled.is_set)
+            with self._cores.in_background():
+                key = index_key(engine.map_path, settings.map, settings.matcher)
+                index = index_for(engine, settings.index, key, progress, cancelled.is_set)
         except Exception as error:  # whatever it is, the node serves on
             if not cancelled.is_set():
                 reason = f"no view index, without a prior nothing is found: {error}"

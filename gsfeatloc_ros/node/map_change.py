@@ -57,9 +57,10 @@ class MapChange:
         """Load the map beside the executor's thread, and have that use it or go back to the old one."""
         loaded: tuple[Engine, MapSettings] | Exception
         try:
-            map_ = load(settings.map.resolved, lambda: not session.closed)
-            _check_names(session.settings.map, map_)
-            renderer = load(lambda: load_renderer(map_, settings.renderer), lambda: not session.closed)
+            with session.cores.in_background():
+                map_ = load(settings.map.resolved, lambda: not session.closed)
+                _check_names(session.settings.map, map_)
+                renderer = load(lambda: load_renderer(map_, settings.renderer), lambda: not session.closed)
             loaded = session.engine.with_map(map_.path, renderer), map_
         except Exception as error:  # whatever it is, the old map serves on
             loaded = error

@@ -11,6 +11,7 @@ from rclpy.publisher import Publisher
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header
 
+from gsfeatloc_ros.common.threads import Cores
 from gsfeatloc_ros.common.words import in_one_line
 from gsfeatloc_ros.localize.settings import MapSettings
 from gsfeatloc_ros.maps import load_map
@@ -30,13 +31,14 @@ class MapView:
         node: whose topics they are.
         settings: of the map.
         reporter: writes to the log.
+        cores: on which they are made, beside all else.
 
     Raises:
         ValueError: the slice of ~/occupancy has no height.
     """
 
-    def __init__(self, node: Node, settings: MapSettings, reporter: Reporter) -> None:
-        self._node, self._settings, self._reporter = node, settings, reporter
+    def __init__(self, node: Node, settings: MapSettings, reporter: Reporter, cores: Cores) -> None:
+        self._node, self._settings, self._reporter, self._cores = node, settings, reporter, cores
         self._slice = Slice(settings.occupancy_min_height, settings.occupancy_max_height, settings.occupancy_resolution)
         publisher = partial(node.create_publisher, qos_profile=LAST, qos_overriding_options=overridable())
         self._cloud = publisher(PointCloud2, "~/map") if settings.cloud_points else None
@@ -73,6 +75,10 @@ class MapView:
     # In a thread of its own.
 
     def _make(self, wanted: list[Publisher], settings: MapSettings) -> None:
+        with self._cores.in_background():
+            self._publish(wanted, settings)
+
+    def _publish(self, wanted: list[Publisher], settings: MapSettings) -> None:
         try:
             gaussian_map = load_map(settings.path, settings.alignment(), settings.reading)
             header = Header(stamp=self._node.get_clock().now().to_msg(), frame_id=settings.frame_id)

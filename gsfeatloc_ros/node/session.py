@@ -8,6 +8,7 @@ from dataclasses import replace
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
+from gsfeatloc_ros.common.threads import Cores
 from gsfeatloc_ros.localize.engine import Engine
 from gsfeatloc_ros.localize.settings import MapSettings
 from gsfeatloc_ros.node.attempts import Attempts, Outputs
@@ -55,6 +56,7 @@ class Session:
         inputs: what images are localized with.
         report: of how it goes.
         settings: as they are now.
+        cores: on which it works in the background.
         active: whether it listens and publishes.
         closed: whether it has ended.
 
@@ -68,6 +70,7 @@ class Session:
         self._node, self._transforms = node, transforms
         self.settings = settings
         self.active = self.closed = False
+        self.cores = Cores(settings.cpu.threads)
         state = LocalizationState(settings.recovery.state, lambda: node.get_clock().now().nanoseconds)
         inputs = Inputs(
             settings.prior_policy(),
@@ -90,12 +93,12 @@ class Session:
         self._standing = StandingPublisher(node, state, reporter, withheld)
         self._pose_file = PoseFile(settings.state.path, settings.map, reporter)
         self._use_saved_pose()
-        self._map_view = MapView(node, settings.map, reporter)
+        self._map_view = MapView(node, settings.map, reporter, self.cores)
         outputs = Outputs(self._publishers, self._standing, self._pose_file, self.report)
         self.attempts = Attempts(engine, self._follower, outputs)
         self.reception = Reception(node, settings, inputs, self.report, self.attempts.offer)
         self._graph = GraphWatch(node, reporter)
-        self._index_build = IndexBuild(self.attempts, reporter)
+        self._index_build = IndexBuild(self.attempts, reporter, self.cores)
         self._index_build.start(settings)
         # On a clock of its own: that of a simulation may stand still.
         steady = Clock(clock_type=ClockType.STEADY_TIME)

@@ -1,11 +1,20 @@
-"""One limit for all threads that compute."""
+"""One limit for all threads that compute, and for the cores that those in the background take."""
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import subprocess
 import sys
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+
+import pytest
+
+from gsfeatloc_ros.common.threads import Cores
 
 # As in the node: numpy, OpenCV and numba are there before the limit is known, torch and faiss come later, and work is
 # done in a thread of its own.
@@ -37,3 +46,69 @@ def test_the_limit_holds_for_all_libraries():
     assert {"cv2", "numba", "torch", "faiss"} < set(found)
     assert any("openblas" in name for name in found)
     assert set(found.values()) == {1}, found
+
+
+def cores_of_threads():
+    """The cores on which each thread of this process may run."""
+    return [os.sched_getaffinity(int(thread)) for thread in os.listdir("/proc/self/task")]
+
+
+@contextmanager
+def busy_thread():
+    """A thread that works all the time, and lets others do so too."""
+    ended = threading.Event()
+
+    def work():
+        data = bytes(10_000_000)
+        while not ended.is_set():
+            hashlib.sha256(data).digest()
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    try:
+        yield thread
+    finally:
+        ended.set()
+        thread.join()
+
+
+needs_two_cores = pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="there is one core")
+
+
+@needs_two_cores
+def test_work_in_the_background_shares_the_cores():
+    cores, used = Cores(1), []
+
+    def background():
+        with cores.in_background(), cores.in_background():
+            found = cores_of_threads()
+            assert len(set(map(frozenset, found))) == 1
+            assert len(found[0]) == 1
+            with busy_thread():
+                start, work = time.monotonic(), time.process_time()
+                while time.monotonic() < start + 0.5:
+                    hashlib.sha256(bytes(1_000_000)).digest()
+                used.append((time.process_time() - work) / (time.monotonic() - start))
+
+    with busy_thread():
+        run_in_thread(background)
+        assert used[0] < 1.1
+        assert set(map(frozenset, cores_of_threads())) == {frozenset(os.sched_getaffinity(0))}
+
+
+@pytest.mark.parametrize("count", [0, 100_000])
+def test_without_a_limit_the_kernel_chooses_the_cores(count):
+    def background():
+        with Cores(count).in_background():
+            assert os.getpriority(os.PRIO_PROCESS, threading.get_native_id()) > os.getpriority(
+                os.PRIO_PROCESS, os.getpid()
+            )
+            assert set(map(frozenset, cores_of_threads())) == {frozenset(os.sched_getaffinity(os.getpid()))}
+
+    run_in_thread(background)
+
+
+def run_in_thread(work):
+    """Run it in a thread of its own, which ends nicer than it began; raise what it raises."""
+    with ThreadPoolExecutor(1) as pool:
+        pool.submit(work).result()
