@@ -16,7 +16,7 @@ from std_srvs.srv import Trigger
 
 from gsfeatloc_ros.client.client_node import ClientNode
 from gsfeatloc_ros.client.messages import camera_info_of, pose_with_covariance, rgb_image
-from gsfeatloc_ros.client.robot import PHOTOS, Drift, camera_of, true_poses
+from gsfeatloc_ros.client.robot import PHOTOS, Drift, Stream, camera_of
 from gsfeatloc_ros.node.qos import REQUESTS
 from gsfeatloc_ros.ros_io.outcome import OutcomeStatus
 
@@ -73,12 +73,12 @@ class FloodProcess:
         replies: to it, once they were taken in.
     """
 
-    def __init__(self, flood: Flood, photos_file: Path, size: tuple[int, int]) -> None:
+    def __init__(self, flood: Flood, photos_file: Path, stream: Stream) -> None:
         self.flood = flood
         self.replies: list[FloodReply] = []
         context = multiprocessing.get_context("spawn")
         self._queue: Queue[list[FloodReply]] = context.Queue()
-        self._process = context.Process(target=run_flood, args=(flood, photos_file, size, self._queue))
+        self._process = context.Process(target=run_flood, args=(flood, photos_file, stream, self._queue))
         self._started = False
 
     def step(self, seconds: float) -> bool:
@@ -96,11 +96,11 @@ class FloodProcess:
             self._process.terminate()
 
 
-def run_flood(flood: Flood, photos_file: Path, size: tuple[int, int], replies: Queue[list[FloodReply]]) -> None:
+def run_flood(flood: Flood, photos_file: Path, stream: Stream, replies: Queue[list[FloodReply]]) -> None:
     """Send a flood, and put its replies into the queue."""
     client = ClientNode("flood")
     try:
-        replies.put(_Sender(client, flood, photos_file, size).run())
+        replies.put(_Sender(client, flood, photos_file, stream).run())
     finally:
         client.close()
 
@@ -124,15 +124,16 @@ def summarize_flood(flood: Flood, replies: list[FloodReply]) -> dict[str, Any]:
 
 
 class _Sender:
-    def __init__(self, client: ClientNode, flood: Flood, photos_file: Path, size: tuple[int, int]) -> None:
+    def __init__(self, client: ClientNode, flood: Flood, photos_file: Path, stream: Stream) -> None:
         self._client, self._flood = client, flood
         self._replies: list[FloodReply] = []
         service = Trigger if flood.service == RELOCALIZE else LocalizeImage
         # Many answers may come at once, of which none may be lost on this side.
         self._service = client.node.create_client(service, f"localizer/{flood.service}", qos_profile=REQUESTS)
         if flood.service == LOCALIZE_IMAGE:
-            self._images, self._info = list(map(rgb_image, np.load(photos_file))), camera_info_of(camera_of(size))
-            self._poses, self._drift = true_poses(), Drift(2)
+            self._images = list(map(rgb_image, np.load(photos_file)))
+            self._info = camera_info_of(camera_of(stream.size))
+            self._poses, self._drift = stream.true_poses(), Drift(2)
 
     def run(self) -> list[FloodReply]:
         """Send all requests, wait for the replies, and return them."""

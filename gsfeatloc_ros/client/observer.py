@@ -27,7 +27,7 @@ from gsfeatloc_ros.client.messages import (
     rgb_image,
     stamp_of,
 )
-from gsfeatloc_ros.client.robot import PHOTOS, Drift, camera_of, true_poses
+from gsfeatloc_ros.client.robot import PHOTOS, Drift, Stream, camera_of
 from gsfeatloc_ros.client.score import pose_error
 from gsfeatloc_ros.node.qos import LATCHED
 
@@ -105,6 +105,7 @@ class SoakRecord:
         errors: degrees and metres of the poses that a service answered.
         statuses: how many attempts ended so.
         milliseconds: of every localization.
+        latencies: milliseconds from the stamps of the stream's images to their poses, as the localizer tells them.
         searches: number of those that had to look from other places than the prior.
         counts: of images, as the localizer told them last.
         calls: to services by their names.
@@ -117,6 +118,7 @@ class SoakRecord:
     errors: list[tuple[float, float]] = field(default_factory=list)
     statuses: Counter[str] = field(default_factory=Counter)
     milliseconds: list[float] = field(default_factory=list)
+    latencies: list[float] = field(default_factory=list)
     searches: int = 0
     counts: dict[str, int] = field(default_factory=dict)
     calls: dict[str, list[Call]] = field(default_factory=dict)
@@ -129,20 +131,21 @@ class Observer(ClientNode):
 
     Args:
         photos_file: of prepare_room(); requests carry these photos.
-        size: width and height of the photos.
+        stream: of the robot.
+        calls: whether to call the services.
     """
 
-    def __init__(self, photos_file: Path, size: tuple[int, int]) -> None:
+    def __init__(self, photos_file: Path, stream: Stream, calls: bool = True) -> None:
         super().__init__("observer")
         self.record = SoakRecord()
         self.node.create_subscription(PoseStamped, "ground_truth", self._on_truth, 100)
         self.node.create_subscription(PoseWithCovarianceStamped, "pose", self._on_pose, LATCHED)
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 100)
-        self._calls: list[Callable[[], None]] = [self._relocalize]
+        self._calls: list[Callable[[], None]] = [self._relocalize] if calls else []
         self._relocalize_client = self.node.create_client(Trigger, "localizer/relocalize")
-        if LocalizeImage is not None:
-            self._photos, self._info = np.load(photos_file, mmap_mode="r"), camera_info_of(camera_of(size))
-            self._poses, self._drift = true_poses(), Drift(1)
+        if calls and LocalizeImage is not None:
+            self._photos, self._info = np.load(photos_file, mmap_mode="r"), camera_info_of(camera_of(stream.size))
+            self._poses, self._drift = stream.true_poses(), Drift(1)
             self._localize_client = self.node.create_client(LocalizeImage, "localizer/localize_image")
             self._calls.append(self._localize_image)
         self._due, self._called = 0.0, 0
@@ -167,7 +170,7 @@ class Observer(ClientNode):
             if seconds >= next_sample:
                 self.record.samples.append(Sample.of(pid, seconds))
                 next_sample += _SAMPLE_PERIOD
-            if self._future is None and time.monotonic() >= self._due:
+            if self._calls and self._future is None and time.monotonic() >= self._due:
                 self._calls[self._called % len(self._calls)]()
                 self._called += 1
             self.spin_once()
@@ -218,6 +221,8 @@ class Observer(ClientNode):
                 self.record.counts = {name: int(values[name]) for name in ("images_received", "images_dropped")}
             if diagnostic.name == "localizer: localization" and "stamp" in values:
                 self.record.statuses[values["status"]] += 1
+                if "latency_ms" in values:
+                    self.record.latencies.append(float(values["latency_ms"]))
                 if "ms_total" in values:
                     self.record.milliseconds.append(float(values["ms_total"]))
                     self.record.searches += values["views"] != "0"

@@ -19,6 +19,8 @@ _BLOCKS = 12
 _MIN_RECEPTION = 0.95
 _MAX_LATENCY = 1.5
 _MAX_GROWTH, _MAX_RISE = 0.1, 0.05
+# Cores' time that may be taken of each core allowed, over so many seconds.
+_MAX_CORES, _CORE_SECONDS = 1.1, 5.0
 # With a flood: megabytes that are resident at most, and the share of its quiet rate that the stream keeps at least.
 _MAX_FLOOD_MEMORY, _MIN_STREAM_SHARE = 700.0, 0.3
 
@@ -33,6 +35,14 @@ def growth(samples: list[Sample]) -> float:
     blocks = np.array_split(np.array([(sample.seconds / 60, sample.memory) for sample in samples]), _BLOCKS)
     minutes, medians = np.array([np.median(block, axis=0) for block in blocks]).T
     return float(np.median(np.diff(medians) / np.diff(minutes)))
+
+
+def most_cores(samples: list[Sample]) -> float:
+    """Return how many cores' time was taken at most over _CORE_SECONDS."""
+    seconds, used = np.array([(sample.seconds, sample.cpu) for sample in samples]).T
+    ends = np.searchsorted(seconds, seconds + _CORE_SECONDS)
+    pairs = [(start, end) for start, end in enumerate(ends) if end < len(seconds)]
+    return max(((used[end] - used[start]) / (seconds[end] - seconds[start]) for start, end in pairs), default=np.nan)
 
 
 def last_rise(samples: list[Sample]) -> float:
@@ -83,6 +93,7 @@ def summarize(record: SoakRecord, seconds: float) -> dict[str, Any]:
         "attempts": dict(record.statuses),
         "searches": record.searches,
         "answers": len(degrees),
+        "answers_per_second": round(len(record.answers) / seconds, 2),
         "answers_wrong": wrong,
         "error_degrees_median": round(float(np.median(degrees)), 4),
         "error_degrees_max": round(float(np.max(degrees)), 4),
@@ -90,6 +101,8 @@ def summarize(record: SoakRecord, seconds: float) -> dict[str, Any]:
         "error_metres_max": round(float(np.max(metres)), 5),
         "localization_ms_median": typical,
         "localization_ms_95_percent": round(float(np.percentile(record.milliseconds, 95)), 1),
+        "latency_ms_median": round(float(np.median(record.latencies)), 1),
+        "latency_ms_95_percent": round(float(np.percentile(record.latencies, 95)), 1),
         "worker_busy": round(sum(record.milliseconds) / 1e3 / last.seconds, 3),
         "services": services,
         "services_unanswered": record.unanswered,
@@ -102,6 +115,8 @@ def summarize(record: SoakRecord, seconds: float) -> dict[str, Any]:
         "threads": [warm.threads, last.threads],
         "files": [warm.files, last.files],
         "cpu_seconds": round(last.cpu - record.samples[0].cpu, 1),
+        "cores_after_warm_up": round((last.cpu - warm.cpu) / (last.seconds - warm.seconds), 3),
+        "cores_max": round(most_cores(record.samples), 3),
         "targets": {
             "memory does not grow": leak <= _MAX_GROWTH
             and last.memory <= (1 + _MAX_RISE) * warm.memory
@@ -116,6 +131,11 @@ def summarize(record: SoakRecord, seconds: float) -> dict[str, Any]:
             ),
         },
     }
+
+
+def add_core_target(result: dict[str, Any], threads: int) -> None:
+    """Add to the targets that the localizer keeps to the cores that `cpu.threads` gives it."""
+    result["targets"]["it keeps to its cores"] = bool(result["cores_max"] <= _MAX_CORES * threads)
 
 
 def add_floods(result: dict[str, Any], record: SoakRecord, floods: list[tuple[Flood, list[FloodReply]]]) -> None:

@@ -13,6 +13,7 @@ from gsfeatloc_ros.localize.options import LocalizerOptions
 from gsfeatloc_ros.localize.settings import MapSettings
 from gsfeatloc_ros.maps import ReadOptions
 from gsfeatloc_ros.render import Renderer
+from gsfeatloc_ros.ros_io.parameter_file import parse_parameter
 
 # Have options of the commands of their own.
 _OWN_OPTIONS = ("max_image_width", "seed")
@@ -36,6 +37,14 @@ class CollectSettings(argparse.Action):
         """Add a pair."""
         assert isinstance(values, tuple)
         setattr(namespace, self.dest, getattr(namespace, self.dest) | dict([values]))
+
+
+def node_parameter(text: str) -> tuple[str, Any]:
+    """Parse NAME:=VALUE of a parameter of the node."""
+    try:
+        return parse_parameter(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
 
 
 def localizer_options() -> dict[str, type]:

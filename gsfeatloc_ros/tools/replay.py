@@ -18,7 +18,6 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from tqdm import tqdm
 
@@ -39,7 +38,7 @@ from gsfeatloc_ros.replay.run import Replay, ReplayedImage
 from gsfeatloc_ros.replay.summary import summary
 from gsfeatloc_ros.replay.truth import Trajectory
 from gsfeatloc_ros.ros_io.calibration_file import read_calibration
-from gsfeatloc_ros.ros_io.parameter_file import parse_parameter, read_parameter_file
+from gsfeatloc_ros.ros_io.parameter_file import read_parameter_file
 from gsfeatloc_ros.ros_io.prior import PriorPolicy
 from gsfeatloc_ros.ros_io.settings import Settings
 from gsfeatloc_ros.tools.options import (
@@ -47,6 +46,7 @@ from gsfeatloc_ros.tools.options import (
     add_map_options,
     localizer_options,
     map_settings,
+    node_parameter,
     number,
     print_reading,
     setting,
@@ -203,7 +203,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "-p",
         dest="parameter",
-        type=_parameter,
+        type=node_parameter,
         action="append",
         default=[],
         metavar="NAME:=VALUE",
@@ -241,14 +241,6 @@ def make_parser() -> argparse.ArgumentParser:
     )
     add_map_options(parser)
     return parser
-
-
-def _parameter(text: str) -> tuple[str, Any]:
-    """Parse NAME:=VALUE."""
-    try:
-        return parse_parameter(text)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from error
 
 
 if __name__ == "__main__":

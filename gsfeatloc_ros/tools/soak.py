@@ -5,6 +5,11 @@ are off as a robot's odometry is. Meanwhile the services are called every few se
 
     gsfeatloc soak --seconds 600 --size 1920x1080 --rate 10 --folder /tmp/soak --json soak.json
 
+With --track the robot has odometry and no priors but the first second's, walks no faster than time, and the node goes
+on from its own answers. How many answers a second, how late, and for how much CPU, at 30 Hz on one core:
+
+    gsfeatloc soak --seconds 60 --rate 30 --track --no-calls -p cpu.threads:=1
+
 With --faults a process of its own makes one every two seconds: parameters of no type, malformed messages and requests,
 maps that are bombs or pipes, and the map itself with planted caches; all that is asked has to be answered.
 
@@ -27,8 +32,9 @@ from gsfeatloc_ros.client.faults import run_faults
 from gsfeatloc_ros.client.flood import LOCALIZE_IMAGE, RELOCALIZE, Flood, FloodProcess
 from gsfeatloc_ros.client.observer import Observer
 from gsfeatloc_ros.client.process import isolate_ros, running_localizer
-from gsfeatloc_ros.client.robot import prepare_room, run_robot
-from gsfeatloc_ros.client.soak_report import add_floods, summarize
+from gsfeatloc_ros.client.robot import Stream, prepare_room, run_robot
+from gsfeatloc_ros.client.soak_report import add_core_target, add_floods, summarize
+from gsfeatloc_ros.tools.options import node_parameter
 from gsfeatloc_ros.tools.status import run_tool
 
 
@@ -40,16 +46,18 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _soak(args: argparse.Namespace) -> int:
     print(f"soak: the map and the photos are kept in {args.folder}", file=sys.stderr)
-    map_file, photos_file = prepare_room(args.folder, args.size)
+    stream = Stream(args.size, args.rate, args.seconds, args.track)
+    map_file, photos_file = prepare_room(args.folder, stream)
     isolate_ros()
     context = multiprocessing.get_context("spawn")
-    robot = context.Process(target=run_robot, args=(photos_file, args.size, args.rate, args.seconds))
+    robot = context.Process(target=run_robot, args=(photos_file, stream))
     made, unanswered = context.Value("q", 0), context.Value("q", 0)
     faults = context.Process(target=run_faults, args=(map_file.resolve(), args.size, made, unanswered))
-    observer = Observer(photos_file, args.size)
-    floods = [FloodProcess(flood, photos_file, args.size) for flood in args.flood]
+    observer = Observer(photos_file, stream, args.calls)
+    floods = [FloodProcess(flood, photos_file, stream) for flood in args.flood]
+    parameters = {"map.path": map_file.resolve(), "track": args.track} | dict(args.parameter)
     try:
-        with running_localizer({"map.path": map_file.resolve()}) as localizer:
+        with running_localizer(parameters) as localizer:
             localizer.wait_until_ready()
             robot.start()
             if args.faults:
@@ -66,11 +74,13 @@ def _soak(args: argparse.Namespace) -> int:
         for flood in floods:
             flood.stop()
     record = observer.record
-    if not (record.answers and record.calls):
+    if not record.answers or (args.calls and not record.calls):
         print("soak: the localizer gave no pose, or answered no request", file=sys.stderr)
         return 1
     size = f"{args.size[0]}x{args.size[1]}"
     result = {"size": size, "rate": args.rate} | summarize(record, args.seconds)
+    if parameters.get("cpu.threads"):
+        add_core_target(result, int(parameters["cpu.threads"]))
     if args.faults:
         result |= {"faults": made.value, "faults_unanswered": unanswered.value}
         result["targets"]["faults are answered"] = unanswered.value == 0
@@ -101,6 +111,17 @@ def make_parser() -> argparse.ArgumentParser:
         action="append",
         default=[],
         help="SERVICE,REQUESTS,RATE,SECOND: requests on top, so many a second (0: at once), from that second on",
+    )
+    parser.add_argument("--track", action="store_true", help="odometry in place of priors, and track:=true")
+    parser.add_argument("--no-calls", dest="calls", action="store_false", help="do not call the services")
+    parser.add_argument(
+        "-p",
+        dest="parameter",
+        type=node_parameter,
+        action="append",
+        default=[],
+        metavar="NAME:=VALUE",
+        help="of the node",
     )
     parser.add_argument("--faults", action="store_true", help="make a fault every two seconds")
     parser.add_argument("--json", type=Path, help="file of the results")
