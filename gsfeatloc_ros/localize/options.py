@@ -21,6 +21,8 @@ class SearchOptions:
 
     Attributes:
         skipped: of the views that most speaks for, so many are left out: they were looked at in vain already.
+        usual_covariance: (6, 6) of how far off the prior usually is, where its own allows for more: of an answer that
+            is gone on from. It says what to try first, and forbids nothing; None for the prior's own.
     """
 
     max_seconds: float = parameter(
@@ -30,6 +32,7 @@ class SearchOptions:
         100, "Most views of the index that are compared with an image; 0 for none.", (0, 1_000_000), live=True
     )
     skipped: int = 0
+    usual_covariance: np.ndarray | None = field(default=None, compare=False)
 
 
 @dataclass(frozen=True)

@@ -17,11 +17,12 @@ _MIN_VARIANCE_SHARE = 0.01
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """A pose (4, 4) T_map_camera with its covariance (6, 6), and that of priors which come without."""
+    """A pose (4, 4) T_map_camera with its covariance (6, 6), that of priors which come without, and its usual one."""
 
     pose: np.ndarray
     covariance: np.ndarray
     default_covariance: np.ndarray
+    usual_covariance: np.ndarray
 
     @staticmethod
     def of(T_map_camera: np.ndarray | None, covariance: np.ndarray | None, options: LocalizerOptions) -> Prior | None:
@@ -38,8 +39,12 @@ class Prior:
             covariance = options.prior_covariance()
         if np.shape(covariance) != (6, 6) or not np.isfinite(covariance).all():
             raise ValueError("the prior's covariance must be a finite 6x6 matrix")
+        covariance, usual = np.asarray(covariance, np.float64), options.search.usual_covariance
         return Prior(
-            np.asarray(T_map_camera, np.float64), np.asarray(covariance, np.float64), options.prior_covariance()
+            np.asarray(T_map_camera, np.float64),
+            covariance,
+            options.prior_covariance(),
+            covariance if usual is None else usual,
         )
 
     def deviation(self, pose: np.ndarray) -> float:

@@ -31,7 +31,7 @@ def is_worth_tracking(render: Render, camera: Camera, prior: Prior) -> bool:
 
 
 def expected_offset(render: Render, camera: Camera, prior: Prior) -> float:
-    """Return by how many pixels the photo is off from a render at its prior: RMS by the covariance, at a median pixel.
+    """Return by how many pixels the photo usually is off from a render at its prior: RMS, at a median pixel.
 
     Infinite where the map shows nothing.
     """
@@ -49,5 +49,5 @@ def expected_offset(render: Render, camera: Camera, prior: Prior) -> float:
     if jacobians is None:
         return float("inf")
     _, by_pose, _ = jacobians
-    variances = np.einsum("mij,jk,mik->m", by_pose, prior.covariance, by_pose)
+    variances = np.einsum("mij,jk,mik->m", by_pose, prior.usual_covariance, by_pose)
     return float(np.median(np.sqrt(np.maximum(variances, 0.0))))

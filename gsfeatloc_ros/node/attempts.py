@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import traceback
 from collections.abc import Callable
 from concurrent.futures import Future
@@ -74,12 +75,14 @@ class JobResult:
         answer: as it is published; None unless localized.
         candidates: poses that explain the image about equally well, if that is why there is no answer.
         prior: what is known of the prior, by key.
+        latency: seconds from the image's stamp to the pose; NaN where none was published, or it has no stamp.
     """
 
     outcome: Outcome
     answer: Answer | None = None
     candidates: PoseArray | None = None
     prior: dict[str, str] = field(default_factory=dict)
+    latency: float = math.nan
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,6 +203,8 @@ class Attempts:
         about = result.prior | {"state": self._follower.state.standing().state.value}
         if result.answer:
             about |= protection_texts(result.answer.protection)
+        if not math.isnan(result.latency):
+            about["latency_ms"] = f"{1e3 * result.latency:.1f}"
         self._outputs.report.publish_attempt(job.message.header.stamp, result.outcome, about, stack)
         return result
 
@@ -215,7 +220,7 @@ class Attempts:
             if job.shared and self.publishing:
                 publishers.publish_refused(job.message, error)
             return JobResult(Outcome.refused(error))
-        localizer = engine.with_options(self._options(engine.options, job)).localizer
+        localizer = engine.with_options(self._options(engine.options, job, query)).localizer
         trace = localizer.trace(
             query.image, query.camera, query.T_map_camera_prior, query.prior_covariance, interrupted
         )
@@ -237,9 +242,9 @@ class Attempts:
             self._follower.take_requested(query, header, T_map_camera)
         return result
 
-    def _options(self, options: LocalizerOptions, job: Job) -> LocalizerOptions:
-        """Return the options for a job."""
-        options = self._follower.options(options, job.message.header)
+    def _options(self, options: LocalizerOptions, job: Job, query: LocalizerInput) -> LocalizerOptions:
+        """Return the options for a job, whose image is localized with `query`."""
+        options = self._follower.options(options, job.message.header, query)
         if job.max_seconds > 0:
             search = replace(options.search, max_seconds=job.max_seconds)
             options = replace(options, deadline=job.max_seconds, search=search)
@@ -254,8 +259,9 @@ class Attempts:
         if judgement.decision is Decision.AWAIT:
             result = replace(result, outcome=Outcome.of(estimate, judgement), answer=None)
         elif result.answer is not None and T_map_camera is not None:
-            outputs.report.count_answer()
-            outputs.publishers.publish_answer(result.answer, T_map_camera, extrinsics)
+            latency = outputs.publishers.publish_answer(result.answer, T_map_camera, extrinsics)
+            outputs.report.count_answer(latency)
+            result = replace(result, latency=latency)
             outputs.pose_file.take(T_map_camera)
             if judgement.note:
                 outputs.report.note(judgement.note)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -143,23 +144,29 @@ class Publishers:
         """Publish poses of which nobody knows which is the right one."""
         self._candidates.publish(candidates)
 
-    def publish_answer(self, answer: Answer, T_map_camera: np.ndarray, extrinsics: Extrinsics) -> None:
+    def publish_answer(self, answer: Answer, T_map_camera: np.ndarray, extrinsics: Extrinsics) -> float:
         """Publish an answer, and from now on the transform that follows from it.
 
         Args:
             answer: to publish.
             T_map_camera: (4, 4).
             extrinsics: at the image's stamp.
+
+        Returns:
+            The seconds on the node's clock from the image's stamp to the pose; NaN where it has no stamp.
         """
         header = answer.pose.header
         self._pose.publish(answer.pose)
+        stamp = nanoseconds(header.stamp)
+        latency = 1e-9 * (self._node.get_clock().now().nanoseconds - stamp) if stamp else math.nan
         if self._protection is not None:
             self._protection.publish(protection_message(answer.protection, header))
-        self.last_stamp = nanoseconds(header.stamp)
+        self.last_stamp = stamp
         T_map_odom = extrinsics.T_map_odom(T_map_camera)
         if T_map_odom is not None:
             self._T_map_odom = T_map_odom
             self._broadcast()
+        return latency
 
     def publish_pictures(self, trace: Trace, header: Header) -> None:
         """Publish what there is to see of an image, each picture if somebody subscribes.

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
 from builtin_interfaces.msg import Time
 
 from gsfeatloc_ros.crosscheck.fit import Cause
@@ -50,6 +52,8 @@ class Health:
         self._attempts: deque[_Attempt] = deque(maxlen=_MAX_COUNTED)
         self._images: deque[float] = deque(maxlen=_MAX_COUNTED)
         self._unserved: deque[float] = deque(maxlen=_MAX_COUNTED)
+        # When answers were published, and seconds from their images' stamps to that.
+        self._latencies: deque[tuple[float, float]] = deque(maxlen=_MAX_COUNTED)
         self._stage_texts: dict[str, str] = {}
 
     def count_image(self) -> None:
@@ -65,6 +69,11 @@ class Health:
         self._attempts.append(_Attempt(self._now(), outcome.status, outcome.reason))
         if outcome.estimate is not None:
             self._stage_texts = stage_texts(outcome.estimate)
+
+    def count_answer(self, latency: float) -> None:
+        """Count an answer so many seconds after its image's stamp; NaN where that has none."""
+        if not math.isnan(latency):
+            self._latencies.append((self._now(), latency))
 
     @property
     def silence(self) -> float:
@@ -101,11 +110,15 @@ class Health:
         """Return rates, shares and times by key."""
         images, attempts, recent = self._images.copy(), self._attempts.copy(), self._recent()
         answers, since = _answers(recent), self._now() - _WINDOW
+        latencies = [1e3 * latency for moment, latency in self._latencies.copy() if moment > since]
+        median, most = np.percentile(latencies, [50, 95]) if latencies else (math.nan, math.nan)
         return {
             "image_rate": f"{sum(moment > since for moment in images) / _WINDOW:.1f}",
             "attempt_rate": f"{len(recent) / _WINDOW:.1f}",
             "answer_rate": f"{answers / _WINDOW:.1f}",
             "acceptance": f"{answers / len(recent):.2f}" if recent else "nan",
+            "latency_ms_median": f"{median:.1f}",
+            "latency_ms_95_percent": f"{most:.1f}",
             "last_reason": attempts[-1].reason if attempts else "",
             **self._stage_texts,
         }
@@ -154,9 +167,10 @@ class Report:
         self.images += 1
         self.health.count_image()
 
-    def count_answer(self) -> None:
-        """Count an answer that is published."""
+    def count_answer(self, latency: float) -> None:
+        """Count an answer that was published so many seconds after its image's stamp; NaN where that has none."""
         self.answers += 1
+        self.health.count_answer(latency)
 
     def count_unserved(self, service: str, reason: str) -> None:
         """Count and log a request that was told that the node is busy."""

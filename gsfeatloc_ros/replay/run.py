@@ -226,7 +226,7 @@ class Replay:
             extrinsics = self._frames.extrinsics(self._lookup, message.header)
         except ValueError as error:
             return ReplayedImage(bag_time, stamp, Outcome.refused(error), self._standing)
-        options = follower.options(self._engine.options, message.header)
+        options = follower.options(self._engine.options, message.header, query)
         localizer = self._engine.with_options(options).localizer
         estimate = localizer.localize(query.image, query.camera, query.T_map_camera_prior, query.prior_covariance)
         outcome = Outcome.of(estimate, follower.take(query, message.header, estimate))

@@ -54,14 +54,20 @@ class Follower:
             query = self._inputs.for_image(message, camera, prior, inputs and inputs.without_prior())
         return query
 
-    def options(self, options: LocalizerOptions, header: Header) -> LocalizerOptions:
+    def options(self, options: LocalizerOptions, header: Header, query: LocalizerInput) -> LocalizerOptions:
         """Return the options for the next image, of this header: what was searched in vain is searched otherwise.
 
         That is with another seed, and in other views of the index until the camera has moved.
+
+        Args:
+            options: of the localizer.
+            header: of the image.
+            query: what it is localized with.
         """
         skipped = self._looked_at if self._is_where_it_looked(header) else 0
         seed = (options.seed + self.state.failures) % (MAX_SEED + 1)
-        return replace(options, seed=seed, search=replace(options.search, skipped=skipped))
+        search = replace(options.search, skipped=skipped, usual_covariance=query.usual_covariance)
+        return replace(options, seed=seed, search=search)
 
     def take(self, query: LocalizerInput, header: Header, estimate: Estimate) -> Judgement:
         """Take what came of an image that came by itself, and return what is to be done.

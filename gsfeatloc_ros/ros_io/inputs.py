@@ -11,14 +11,14 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 
 from gsfeatloc_ros.common.camera import Camera
-from gsfeatloc_ros.common.geometry import invert, rotate_covariance, shift_covariance
+from gsfeatloc_ros.common.geometry import invert, isotropic_covariance, rotate_covariance, shift_covariance
 from gsfeatloc_ros.ros_io.calibration import decode_camera
 from gsfeatloc_ros.ros_io.compressed_image import PictureError
 from gsfeatloc_ros.ros_io.decode import decode_pose, frame_name, nanoseconds
 from gsfeatloc_ros.ros_io.growth import Growth, Travelled, position_sigma
 from gsfeatloc_ros.ros_io.message_types import AnyImage
 from gsfeatloc_ros.ros_io.message_types import Odometry as OdometryMessage
-from gsfeatloc_ros.ros_io.odometry import OdometryBuffer
+from gsfeatloc_ros.ros_io.odometry import OdometryBuffer, Way
 from gsfeatloc_ros.ros_io.pictures import PictureReader
 from gsfeatloc_ros.ros_io.prior import Prior, PriorPolicy, PriorSource, body_of, decode_prior
 
@@ -29,6 +29,9 @@ Lookup = Callable[[str, str, int], np.ndarray]
 
 # Seconds. Images may come later than the odometry of their time by this much.
 _MAX_IMAGE_DELAY = 5.0
+# What is gone on from, and how far off (6, 6) that usually is to begin with: map units and radians.
+_ANSWERS = (PriorSource.LAST_ANSWER, PriorSource.UNCONFIRMED)
+_OF_ANSWERS = isotropic_covariance(0.01, np.radians(0.5))
 
 
 class InputTopic(Enum):
@@ -51,6 +54,7 @@ class LocalizerInput:
         prior_covariance: (6, 6) in ROS order about the map's axes, or None where it is not known.
         prior: what the two were made of, if anything.
         newest_prior: the newest that came from outside or was an answer, used or not.
+        usual_covariance: (6, 6) of how far off the prior usually is, where prior_covariance allows for more; else None.
     """
 
     image: np.ndarray
@@ -59,6 +63,7 @@ class LocalizerInput:
     prior_covariance: np.ndarray | None
     prior: Prior | None
     newest_prior: Prior | None
+    usual_covariance: np.ndarray | None
 
     @property
     def source(self) -> PriorSource | None:
@@ -296,8 +301,9 @@ class Inputs:
             )
         stamp, frame = nanoseconds(message.header.stamp), frame_name(message.header.frame_id)
         pose, covariance = (None, None) if prior is None else self._at(prior, stamp, frame)
+        usual = None if prior is None else self._usual_covariance(prior, stamp)
         camera = replace(camera, readout=self._readout(stamp, frame, picture.height))
-        return LocalizerInput(picture.decode(), camera, pose, covariance, prior, newest.value)
+        return LocalizerInput(picture.decode(), camera, pose, covariance, prior, newest.value, usual)
 
     def _set_prior(self, newest: _Newest[Prior]) -> None:
         with self._prior_lock:
@@ -343,7 +349,7 @@ class Inputs:
         if not stamp or not prior.stamp:
             return pose, covariance
         age = 1e-9 * (stamp - prior.stamp)
-        way = self._odometry.between(prior.stamp, stamp) if abs(age) <= policy.odometry_max_age else None
+        way = self._way(prior, stamp)
         if way is not None:
             T_body_camera = self.camera_on_body(camera_frame, stamp)
             pose = pose @ invert(T_body_camera) @ way.motion @ T_body_camera
@@ -356,6 +362,19 @@ class Inputs:
         if prior.source.own or (policy.max_age and age > policy.max_age):
             covariance = self._grown(covariance, policy.growth.by_time(age))
         return pose, covariance
+
+    def _usual_covariance(self, prior: Prior, stamp: int) -> np.ndarray | None:
+        """Return how far off (6, 6) an answer usually is at `stamp`, when it was right; None for other priors."""
+        if not (prior.source in _ANSWERS and stamp and prior.stamp):
+            return None
+        way, growth = self._way(prior, stamp), self.policy.growth
+        grown = growth.by_time(1e-9 * (stamp - prior.stamp)) if way is None else growth.by_odometry(way.travelled)
+        return grown.added_to(_OF_ANSWERS, self.policy.planar)
+
+    def _way(self, prior: Prior, stamp: int) -> Way | None:
+        """Return how the robot went from a prior's time to `stamp`; None where odometry does not carry it there."""
+        age = 1e-9 * abs(stamp - prior.stamp)
+        return self._odometry.between(prior.stamp, stamp) if age <= self.policy.odometry_max_age else None
 
     def _transform(self, target: str, source: str, stamp: int) -> np.ndarray:
         return np.eye(4) if target == source else self._lookup(target, source, stamp)

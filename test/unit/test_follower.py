@@ -69,12 +69,25 @@ def test_found_without_a_prior_and_followed():
     robot.drive(104)
     query = robot.follower.for_image(image(104))
     np.testing.assert_allclose(query.T_map_camera_prior, along(4), atol=1e-9)
+    # It may be anywhere near, but is by 2 metres of odometry, of which a tenth may be wrong, from an answer.
+    usual = robot.follower.options(LocalizerOptions(), image(104).header, query).search.usual_covariance
+    assert np.sqrt(usual[0, 0]) == pytest.approx(np.hypot(0.01, 0.2))
+    assert query.prior_covariance[0, 0] > usual[0, 0]
+
+
+def test_how_far_off_a_prior_from_outside_usually_is_its_covariance_says():
+    robot = Robot()
+    robot.inputs.take(InputTopic.PRIOR, prior(100.0, along(0)))
+    query = robot.follower.for_image(image(100))
+    assert query.source is PriorSource.PRIOR
+    assert query.usual_covariance is None
 
 
 def skipped(robot: Robot, seconds: float) -> int:
     """How many views of the index an image leaves out."""
     robot.drive(seconds)
-    return robot.follower.options(LocalizerOptions(), image(seconds).header).search.skipped
+    query = robot.follower.for_image(image(seconds))
+    return robot.follower.options(LocalizerOptions(), image(seconds).header, query).search.skipped
 
 
 def test_a_robot_that_stands_looks_at_other_views_each_time() -> None:

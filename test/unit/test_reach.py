@@ -10,7 +10,7 @@ import pytest
 from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.geometry import invert, isotropic_covariance, make_pose, moved, so3_exp, transform
 from gsfeatloc_ros.localize.localizer import Localizer
-from gsfeatloc_ros.localize.options import LocalizerOptions
+from gsfeatloc_ros.localize.options import LocalizerOptions, SearchOptions
 from gsfeatloc_ros.localize.prior import Prior
 from gsfeatloc_ros.localize.reach import expected_offset, is_worth_tracking
 from gsfeatloc_ros.match import create_matcher
@@ -29,7 +29,7 @@ def wall(depth: float) -> Render:
 
 
 def prior(covariance: np.ndarray) -> Prior:
-    return Prior(POSE, covariance, LocalizerOptions().prior_covariance())
+    return Prior(POSE, covariance, LocalizerOptions().prior_covariance(), covariance)
 
 
 def test_where_the_map_shows_nothing_it_is_not_tracked() -> None:
@@ -60,6 +60,13 @@ def test_a_sure_prior_is_tracked_and_an_unsure_one_is_not() -> None:
     assert is_worth_tracking(wall(2.0), CAMERA, prior(SURE))
     assert is_worth_tracking(wall(2.0), CAMERA, prior(np.zeros((6, 6))))
     assert not is_worth_tracking(wall(2.0), CAMERA, prior(UNSURE))
+
+
+def test_of_an_answer_that_is_gone_on_from_counts_how_far_off_it_usually_is() -> None:
+    search = SearchOptions(usual_covariance=SURE)
+    known = Prior.of(POSE, UNSURE, LocalizerOptions(search=search))
+    assert is_worth_tracking(wall(2.0), CAMERA, known)
+    assert known.deviation(moved(POSE, np.full(6, 0.5))) == prior(UNSURE).deviation(moved(POSE, np.full(6, 0.5)))
 
 
 @pytest.fixture(scope="module")
