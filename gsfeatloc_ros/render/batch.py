@@ -72,7 +72,7 @@ def load_batch(splats, keys, first, x0, y0, nearest, starts, batch, members):
     """
     count = min(BATCH_SIZE, len(keys) - first)
     for k in range(count):
-        starts[k] = record(keys[first + k])
+        starts[_U(k)] = record(keys[_U(first + k)])
     # The last LANES are filled up with the last splat.
     for k in range(count, -(-count // LANES) * LANES):
         starts[k] = starts[count - 1]

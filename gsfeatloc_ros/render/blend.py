@@ -73,10 +73,12 @@ def tile_starts(histogram):
 def gather(pair_tiles, pair_keys, pairs, positions, by_tile):
     """Write each thread's pairs to their tiles' lists; `positions` (threads, tiles) is where, and is advanced."""
     for thread in prange(len(pairs)):
+        tiles, keys, places = pair_tiles[thread], pair_keys[thread], positions[thread]
         for pair in range(pairs[thread]):
-            tile = pair_tiles[thread, pair]
-            by_tile[positions[thread, tile]] = pair_keys[thread, pair]
-            positions[thread, tile] += 1
+            tile = _U(tiles[_U(pair)])
+            place = places[tile]
+            by_tile[_U(place)] = keys[_U(pair)]
+            places[tile] = place + 1
 
 
 @intrinsic
@@ -138,8 +140,8 @@ def _blend_tile(splats, keys, x0, y0, nearest, state):
         for block in range(BLOCKS):
             # The records of the next batch come from memory while this one is blended.
             ahead = first + BATCH_SIZE + block * _AHEAD
-            for key in keys[ahead : ahead + _AHEAD]:
-                prefetch(splats, record(key))
+            for place in range(ahead, min(ahead + _AHEAD, len(keys))):
+                prefetch(splats, record(keys[_U(place)]))
             if running[block]:
                 x, y = x0 + _F(block % BLOCKS_X * SQUARE), y0 + _F(block // BLOCKS_X * SQUARE)
                 running[block] = _blend_block(batch, members[block], x, y, running[block], state, block * _STATE_SIZE)

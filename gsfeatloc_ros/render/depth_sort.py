@@ -9,7 +9,7 @@ from gsfeatloc_ros.render.kernels import njit
 # Of a digit of the sort.
 _DIGIT_BITS = 8
 _DIGITS = 1 << _DIGIT_BITS
-# With an unsigned index numba does not look for negative ones.
+# With an unsigned index numba does not look for negative ones, and for what an array yields by itself it multiplies.
 _U = np.uint64
 _DEPTH_SHIFT = _U(32)
 # Moves for each key after which the last bits are sorted by digits too.
@@ -26,8 +26,9 @@ def sorted_by_depth(keys, spare):
     if len(keys) < 2:
         return keys
     low = high = keys[0] >> _DEPTH_SHIFT
-    for key in keys:
-        low, high = min(low, key >> _DEPTH_SHIFT), max(high, key >> _DEPTH_SHIFT)
+    for i in range(len(keys)):
+        depth = keys[_U(i)] >> _DEPTH_SHIFT
+        low, high = min(low, depth), max(high, depth)
     bits = 0
     while (high - low) >> _U(bits):
         bits += 1
@@ -48,8 +49,8 @@ def _sort_two_digits(keys, spare, low, shift):
     counts, upper_counts = np.zeros(_DIGITS, dtype=np.uint32), np.zeros(_DIGITS, dtype=np.uint32)
     down, upper_down = _U(shift), _U(shift + _DIGIT_BITS)
     mask = _U(_DIGITS - 1)
-    for key in keys:
-        depth = (key >> _DEPTH_SHIFT) - low
+    for i in range(len(keys)):
+        depth = (keys[_U(i)] >> _DEPTH_SHIFT) - low
         counts[depth >> down & mask] += np.uint32(1)
         upper_counts[depth >> upper_down & mask] += np.uint32(1)
     total = upper_total = np.uint32(0)
@@ -58,11 +59,13 @@ def _sort_two_digits(keys, spare, low, shift):
         counts[digit], upper_counts[digit] = total, upper_total
         total += count
         upper_total += upper_count
-    for key in keys:
+    for i in range(len(keys)):
+        key = keys[_U(i)]
         digit = ((key >> _DEPTH_SHIFT) - low) >> down & mask
         spare[counts[digit]] = key
         counts[digit] += np.uint32(1)
-    for key in spare:
+    for i in range(len(keys)):
+        key = spare[_U(i)]
         digit = ((key >> _DEPTH_SHIFT) - low) >> upper_down & mask
         keys[upper_counts[digit]] = key
         upper_counts[digit] += np.uint32(1)
@@ -73,8 +76,8 @@ def _insert_each(keys):
     """Sort nearly sorted keys by moving each to its place; return False where that takes too long, in some order."""
     moves = 0
     for i in range(1, len(keys)):
-        key = keys[i]
-        if keys[i - 1] >> _DEPTH_SHIFT <= key >> _DEPTH_SHIFT:
+        key = keys[_U(i)]
+        if keys[_U(i - 1)] >> _DEPTH_SHIFT <= key >> _DEPTH_SHIFT:
             continue
         place = i
         while place > 0 and keys[place - 1] >> _DEPTH_SHIFT > key >> _DEPTH_SHIFT:

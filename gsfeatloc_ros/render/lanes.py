@@ -327,6 +327,16 @@ def select(typingctx, mask, a, b):
 
 
 @intrinsic
+def whole(typingctx, values):
+    """Return whole numbers as int32, reinterpreted as float32."""
+
+    def codegen(context, builder, sig, args):
+        return builder.bitcast(builder.fptosi(args[0], _INTS), _FLOATS)
+
+    return _LANES(_LANES), codegen
+
+
+@intrinsic
 def mask_bits(typingctx, mask):
     """Return the mask as a number, of which bit i is lane i."""
 

@@ -24,20 +24,28 @@ from gsfeatloc_ros.render.lanes import (
     offsets,
     sqrt,
     store_columns,
+    whole,
 )
 from gsfeatloc_ros.render.prepare import CHUNK
 
 TILE = 16
 # Fields of a projected splat: alpha = 2^(LOG_OPACITY + CONIC_X (dx - SLANT dy)^2 + CONIC_Y dy^2). Rounding or not, that
 # falls away from the centre; the usual sum of dx^2, dx dy and dy^2 may grow along a long needle. The box holds the
-# pixels with an alpha of MIN_ALPHA, and is whole numbers.
+# pixels with an alpha of MIN_ALPHA, and is whole numbers. The last two are int32: the first tile that the box touches,
+# and how many further columns of tiles, plus _ROW for each further row.
 (X, Y, SLANT, CONIC_X, CONIC_Y, LOG_OPACITY, RED, GREEN, BLUE, DEPTH, LEFT, RIGHT, TOP, BOTTOM) = range(14)
+_FIRST_TILE, _FURTHER_TILES = 14, 15
+_ROW_BITS = 12
+_ROW = 1 << _ROW_BITS
 # One line of the CPU's cache.
 SPLAT_SIZE = 16
 
 _F = np.float32
+# With an unsigned index numba does not look for negative ones.
+_U = np.uint64
 _ZERO, _ONE, _INFINITY = _F(0), _F(1), _F(np.inf)
 _EPS2D, _NEAR = _F(base.EPS2D), _F(base.NEAR_PLANE)
+_PER_TILE = _F(1.0 / TILE)
 _LOG_MIN_ALPHA = _F(math.log2(base.MIN_ALPHA))
 # From -0.5 d^T conic d, and from 2 ln(255 opacity), to base 2.
 _CONIC_SCALE = _F(-0.5 * math.log2(math.e))
@@ -77,13 +85,15 @@ def project(chunks, gaussians, sh, harmonics, antialiased, view, splats, pair_ti
     needed = np.zeros(threads, dtype=np.int64)
     for thread in prange(threads):
         tiles, keys, counts = pair_tiles[thread], pair_keys[thread], histogram[thread]
-        counts[:] = 0
         first, last = len(chunks) * thread // threads, len(chunks) * (thread + 1) // threads
         splat, pairs = first * CHUNK, 0
         for place in range(first, last):
             end = _project_chunk(chunks[place], gaussians, sh, harmonics, antialiased, view, splats, splat)
-            pairs = _list_tiles(splats, splat, end, tiles_x, tiles, keys, pairs, counts)
+            pairs = _list_tiles(splats, splat, end, tiles_x, tiles, keys, pairs)
             splat = end
+        counts[:] = 0
+        for pair in range(min(pairs, len(tiles))):
+            counts[_U(tiles[_U(pair)])] += 1
         needed[thread] = pairs
     return needed
 
@@ -158,7 +168,9 @@ def _project_group(chunk, group, gaussians, sh, harmonics, antialiased, view, sp
         oy * inverse_distance,
         oz * inverse_distance,
     )
-    padding = z
+    tiles_x = _F(-(-view.width // TILE))
+    first_column, first_row = floor(left * _PER_TILE), floor(top * _PER_TILE)
+    columns, rows = floor(right * _PER_TILE) - first_column, floor(bottom * _PER_TILE) - first_row
     return store_columns(
         splats,
         out,
@@ -178,8 +190,8 @@ def _project_group(chunk, group, gaussians, sh, harmonics, antialiased, view, sp
             right,
             top,
             bottom,
-            padding,
-            padding,
+            whole(first_row * tiles_x + first_column),
+            whole(rows * _F(_ROW) + columns),
         ),
     )
 
@@ -227,28 +239,45 @@ def _add_harmonic(sh, at, k, basis, color):
 
 
 @njit
-def _list_tiles(splats, first, last, tiles_x, tiles, keys, pairs, histogram):
+def _list_tiles(splats, first, last, tiles_x, tiles, keys, pairs):
     """Append the tiles that splats touch to a thread's list, which holds `pairs`; return how many it holds then."""
+    numbers = splats.view(np.int32)
     for splat in range(first, last):
-        at = splat * SPLAT_SIZE
-        key = np.uint64(bits_of_float(splats[at + DEPTH])) << np.uint64(32) | np.uint64(splat)
-        left, right = np.int64(splats[at + LEFT]) // TILE, np.int64(splats[at + RIGHT]) // TILE
-        top, bottom = np.int64(splats[at + TOP]) // TILE, np.int64(splats[at + BOTTOM]) // TILE
+        at = _U(splat * SPLAT_SIZE)
+        key = _U(bits_of_float(splats[at + _U(DEPTH)])) << _U(32) | _U(splat)
+        tile, further = np.int64(numbers[at + _U(_FIRST_TILE)]), np.int64(numbers[at + _U(_FURTHER_TILES)])
+        columns, rows = further & (_ROW - 1), further >> _ROW_BITS
+        if columns > 1 or rows > 1 or pairs + 4 > len(tiles):
+            pairs = _list_many_tiles(splats, splat * SPLAT_SIZE, key, tile, columns, rows, tiles_x, tiles, keys, pairs)
+            continue
+        # One tile, two, or four, without a branch on which: that cannot be predicted. What is too much is overwritten.
+        for k in range(4):
+            keys[_U(pairs + k)] = key
+        below = tile + rows * tiles_x
+        tiles[_U(pairs)], tiles[_U(pairs + 1)] = tile, tile + columns
+        pairs += 1 + columns
+        tiles[_U(pairs)], tiles[_U(pairs + 1)] = below, below + columns
+        pairs += rows * (1 + columns)
+    return pairs
+
+
+@njit
+def _list_many_tiles(splats, at, key, tile, columns, rows, tiles_x, tiles, keys, pairs):
+    """Append a splat's tiles, however many, while there is room; return how many pairs there are or would be then."""
+    first_row, first_column = tile // tiles_x, tile % tiles_x
+    for row in range(first_row, first_row + rows + 1):
+        left, right = first_column, first_column + columns
         # The ellipse leaves out the corners of its box; in a smaller one that saves less than it takes to find out.
-        has_corners = right - left > 1 and bottom - top > 1
-        for row in range(top, bottom + 1):
-            if has_corners:
-                low, high = max(_F(row * TILE), splats[at + TOP]), min(_F(row * TILE + TILE - 1), splats[at + BOTTOM])
-                band_left, band_right = _ellipse_in_rows(splats, at, low, high)
-                # In this order they are whole numbers even where the ellipse is NaN.
-                left = np.int64(max(splats[at + LEFT], band_left)) // TILE
-                right = np.int64(min(splats[at + RIGHT], band_right)) // TILE
-            for tile in range(row * tiles_x + left, row * tiles_x + right + 1):
-                if pairs < len(tiles):
-                    tiles[pairs] = tile
-                    keys[pairs] = key
-                histogram[tile] += 1
-                pairs += 1
+        if columns > 1 and rows > 1:
+            low, high = max(_F(row * TILE), splats[at + TOP]), min(_F(row * TILE + TILE - 1), splats[at + BOTTOM])
+            band_left, band_right = _ellipse_in_rows(splats, at, low, high)
+            # In this order they are whole numbers even where the ellipse is NaN.
+            left = np.int64(max(splats[at + LEFT], band_left)) // TILE
+            right = np.int64(min(splats[at + RIGHT], band_right)) // TILE
+        for column in range(left, right + 1):
+            if pairs < len(tiles):
+                tiles[pairs], keys[pairs] = row * tiles_x + column, key
+            pairs += 1
     return pairs
 
 

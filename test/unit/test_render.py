@@ -184,6 +184,31 @@ def test_splats_are_drawn_in_order_however_close_they_are() -> None:
     np.testing.assert_array_equal((drawn[:, 0] > drawn[:, 1])[told_apart], (red_depth < green_depth)[told_apart])
 
 
+@pytest.mark.parametrize("opaque", [0.02, 0.5, 1.0])
+def test_a_camera_inside_dense_matter_sees_what_the_reference_sees(opaque: float) -> None:
+    """Half-transparent or opaque from all sides, and through the near plane: where and behind what rays end matters."""
+    rng = np.random.default_rng(0)
+    cloud = random_map(1500, 1, seed=2)
+    means = rng.uniform(-0.5, 0.5, (len(cloud), 3)).astype(np.float32)
+    dense = replace(cloud, means=means, opacities=np.full(len(cloud), opaque, np.float32))
+    camera = small_camera()
+    fast = create_renderer(dense).render(camera, np.eye(4))
+    assert fast.alpha.min() > 0.5
+    assert_same(fast, ReferenceRenderer(dense).render(camera, np.eye(4)), 70)
+
+
+def test_what_lies_behind_a_wall_does_not_change_the_picture() -> None:
+    """A wall of eight layers lets nothing through: with half of a map behind it the picture is the same to the bit."""
+    layers = [one_gaussian((0, 0, 2 + 0.01 * k), 20.0, 0.9, (0.1 * k, 0.5, 0.3)) for k in range(8)]
+    front, behind = concatenated(*layers), random_map(2000, 0, seed=4)
+    behind = replace(behind, means=behind.means + np.float32([0, 0, 30]))
+    alone, together = (
+        create_renderer(m).render(small_camera(), np.eye(4)) for m in (front, concatenated(front, behind))
+    )
+    for field in ("rgb", "alpha", "depth", "median_depth", "depth_std"):
+        np.testing.assert_array_equal(getattr(together, field), getattr(alone, field))
+
+
 @pytest.mark.slow
 def test_crowded_tiles_make_the_buffers_grow() -> None:
     """Every Gaussian covers every tile: far more pairs than the buffers start with."""
