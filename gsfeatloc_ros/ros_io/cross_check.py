@@ -149,19 +149,27 @@ class CrossCheck:
         odometry = self._inputs.odometry
         while self._waiting and (odometry.newest or 0) >= self._waiting[0].stamp + 1e9 * OFFSETS[-1]:
             answer = self._waiting.popleft()
+            body = odometry.pose(answer.stamp)
+            if body is None or not self._has_moved(body):
+                continue
             found = [odometry.pose(answer.stamp + round(1e9 * offset)) for offset in OFFSETS]
             poses = [pose for pose in found if pose is not None]
             if len(poses) == len(OFFSETS):
                 keyframe = Keyframe(answer.T_map_camera, answer.covariance, answer.T_body_camera, np.array(poses))
                 self._take_keyframe(keyframe)
 
+    def _has_moved(self, T_odom_body: np.ndarray) -> bool:
+        """Return whether the body, now there, has moved since the last keyframe."""
+        if not self._keyframes:
+            return True
+        bodies = self._keyframes[-1].T_odom_body[_MIDDLE], T_odom_body
+        return translation_error(*bodies) >= _MIN_MOTION[0] or rotation_error_deg(*bodies) >= _MIN_MOTION[1]
+
     def _take_keyframe(self, keyframe: Keyframe) -> None:
         if self._keyframes:
             last = self._keyframes[-1]
             bodies = last.T_odom_body[_MIDDLE], keyframe.T_odom_body[_MIDDLE]
             way, turn = translation_error(*bodies), rotation_error_deg(*bodies)
-            if way < _MIN_MOTION[0] and turn < _MIN_MOTION[1]:
-                return
             answered, lever = translation_error(last.T_map_camera, keyframe.T_map_camera), last.T_body_camera[:3, 3]
             swing = np.radians(turn) * np.linalg.norm(lever)
             turned = rotation_error_deg(last.T_map_camera, keyframe.T_map_camera)

@@ -125,7 +125,9 @@ class Follower:
         self._looked_at = 0 if found or looked_at >= estimate.evidence.index_views else looked_at
 
     def _is_where_it_looked(self, header: Header) -> bool:
-        """Return whether the camera is known to be where views of the index were last looked at from."""
+        """Return whether the camera is known to be where views of the index were looked at in vain, if any were."""
+        if not self._looked_at:
+            return False
         travelled = self._inputs.travelled(self._looked_from, nanoseconds(header.stamp))
         return travelled is not None and travelled.distance <= _SAME_VIEW[0] and travelled.turn <= _SAME_VIEW[1]
 

@@ -4,14 +4,10 @@ from __future__ import annotations
 
 import re
 import signal
-import subprocess
-import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
-from pathlib import Path
 
 import numpy as np
 import pytest
+from camera_process import running_camera
 from diagnostic_msgs.msg import DiagnosticStatus
 from node_harness import (
     TIMEOUT,
@@ -71,16 +67,6 @@ def test_sensor_stops_and_returns(client, room_camera, photo):
         assert len(client.health) - seen < 20, client.health[seen:]
 
 
-@contextmanager
-def camera_process(picture: Path) -> Iterator[subprocess.Popen]:
-    process = subprocess.Popen([sys.executable, Path(__file__).parents[1] / "support" / "camera_process.py", picture])
-    try:
-        yield process
-    finally:
-        process.kill()
-        process.wait(TIMEOUT)
-
-
 def test_publisher_is_killed_and_another_one_starts(client, room_camera, photo, tmp_path):
     np.save(tmp_path / "picture.npy", photo.image)
     send_inputs(client, room_camera, photo)
@@ -91,7 +77,7 @@ def test_publisher_is_killed_and_another_one_starts(client, room_camera, photo, 
         for stamp in client.poses.keys() - before:
             assert_close(client.poses[stamp], photo.T_map_camera)
 
-    with camera_process(tmp_path / "picture.npy") as camera:
+    with running_camera(tmp_path / "picture.npy") as camera:
         assert_served()
         assert_health(client, DiagnosticStatus.OK)
         camera.send_signal(signal.SIGKILL)
@@ -99,7 +85,7 @@ def test_publisher_is_killed_and_another_one_starts(client, room_camera, photo, 
         answer = client.relocalize()
         assert not answer.success
         assert "is the camera running?" in answer.message
-    with camera_process(tmp_path / "picture.npy"):
+    with running_camera(tmp_path / "picture.npy"):
         assert_served()
         assert_health(client, DiagnosticStatus.OK)
 

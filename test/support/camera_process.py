@@ -2,14 +2,29 @@
 
 from __future__ import annotations
 
+import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 
 import numpy as np
 import rclpy
 from sensor_msgs.msg import Image
 
 from gsfeatloc_ros.client.messages import rgb_image
+
+
+@contextmanager
+def running_camera(picture: Path) -> Iterator[subprocess.Popen]:
+    """A camera that sends a picture, until it is left."""
+    process = subprocess.Popen([sys.executable, __file__, picture])
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.wait()
 
 
 def main() -> None:
