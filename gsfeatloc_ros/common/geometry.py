@@ -33,10 +33,12 @@ def transform(pose: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 def skew(vector: np.ndarray) -> np.ndarray:
     """Return the cross-product matrices (..., 3, 3) of vectors (..., 3): ``skew(a) @ b == cross(a, b)``."""
-    x, y, z = np.moveaxis(np.asarray(vector, dtype=np.float64), -1, 0)
-    zero = np.zeros_like(x)
-    rows = [[zero, -z, y], [z, zero, -x], [-y, x, zero]]
-    return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
+    vector = np.asarray(vector, dtype=np.float64)
+    matrices = np.zeros((*vector.shape, 3))
+    for row, column, axis in ((2, 1, 0), (0, 2, 1), (1, 0, 2)):
+        matrices[..., row, column] = vector[..., axis]
+        matrices[..., column, row] = -vector[..., axis]
+    return matrices
 
 
 def so3_exp(rotation_vector: np.ndarray) -> np.ndarray:

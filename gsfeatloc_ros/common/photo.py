@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -56,4 +57,8 @@ class Photo:
 
     def gray(self) -> np.ndarray:
         """Return the brightness (H, W) uint8."""
+        return self._gray
+
+    @cached_property
+    def _gray(self) -> np.ndarray:
         return cv2.cvtColor(self.image, cv2.COLOR_RGB2GRAY)

@@ -18,6 +18,7 @@ from gsfeatloc_ros.common.photo import Photo
 from gsfeatloc_ros.localize.localizer import Localizer
 from gsfeatloc_ros.localize.query import Components
 from gsfeatloc_ros.match import Matcher, Matches, Tracker, create_tracker
+from gsfeatloc_ros.match.base import Worth, all_of_them
 from gsfeatloc_ros.pose.lift import LiftOptions
 from gsfeatloc_ros.render.base import Render, Renderer
 
@@ -61,11 +62,11 @@ class FeatureTracker:
         # Dense features have no pixels of their own.
         self.corners = create_tracker(photo, device).corners
 
-    def track(self, image: Array) -> Matches:
+    def track(self, image: Array, worth: Worth = all_of_them) -> Matches:
         """Find the photo's features in a render (H, W, 3) uint8 RGB."""
         return self._matcher.match(self._features, self._matcher.features(image))
 
-    def track_back(self, image: Array) -> Matches:
+    def track_back(self, image: Array, worth: Worth = all_of_them) -> Matches:
         """Find the features of a render in the photo."""
         return self._matcher.match(self._matcher.features(image), self._features).swapped()
 
@@ -77,14 +78,14 @@ class WholePixelTracker:
         self._tracker = create_tracker(photo, device)
         self.corners = self._tracker.corners
 
-    def track(self, image: Array) -> Matches:
+    def track(self, image: Array, worth: Worth = all_of_them) -> Matches:
         """Find the photo's corners in a render (H, W, 3) uint8 RGB."""
-        matches = self._tracker.track(image)
+        matches = self._tracker.track(image, worth)
         return replace(matches, b=np.round(matches.b))
 
-    def track_back(self, image: Array) -> Matches:
+    def track_back(self, image: Array, worth: Worth = all_of_them) -> Matches:
         """Find the corners of a render in the photo, in whole pixels of the render."""
-        matches = self._tracker.track_back(image)
+        matches = self._tracker.track_back(image, worth)
         return replace(matches, b=np.round(matches.b))
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import cv2
 import numpy as np
@@ -13,7 +14,6 @@ from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.local_structure import local_structure
 from gsfeatloc_ros.common.photo import Photo
 from gsfeatloc_ros.localize.query import MatchedView, Query
-from gsfeatloc_ros.pose.lift import lift
 from gsfeatloc_ros.pose.solve import Correspondences
 
 # Cells across and down the photo.
@@ -89,11 +89,12 @@ def compare(
 
     Corners agree with it that are off by at most `tolerance` pixels; `errors` says by how many each of (M,) is.
     """
-    options, camera = query.components.options, query.photo.camera
+    camera, lifted = query.photo.camera, partial(query.lifted, view.pose, view.render)
     with query.clock.stage("track"):
-        back = query.tracker.track_back(view.image)
-    lifted = lift(view.render, camera, view.pose, back.b, options.lift)
-    found = query.correspondences(back.a, lifted, view.pose)
+        back = query.tracker.track_back(view.image, lambda pixels: lifted(pixels).valid)
+        found = query.correspondences(back.a, lifted(back.b), view.pose)
+    with query.clock.stage("verify"):
+        correlation = _correlation(query.photo, view)
     agrees, agrees_back = errors(view.found) <= tolerance, errors(found) <= tolerance
     pixels, all_agree = np.concatenate([view.found.pixels, found.pixels]), np.concatenate([agrees, agrees_back])
     return Comparison(
@@ -101,7 +102,7 @@ def compare(
         render_inlier_ratio=float(agrees_back.mean()) if len(agrees_back) else float("nan"),
         agreeing=_count(pixels[all_agree], camera),
         disagreeing=_count(pixels[~all_agree], camera),
-        correlation=_correlation(query.photo, view),
+        correlation=correlation,
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 
 from gsfeatloc_ros.localize.evidence import coverage
@@ -37,7 +38,7 @@ def too_few_features(small: Query) -> str:
 
 def _share_of_one_shade(levels: np.ndarray) -> float:
     """Return the share of brightnesses (N,) uint8 that are about their median; by their counts, as all photos pay."""
-    counts = np.bincount(levels, minlength=256)
+    counts = cv2.calcHist([levels], [0], None, [256], [0, 256]).ravel().astype(np.int64)
     up_to = np.cumsum(counts)
     median = 0.5 * np.searchsorted(up_to, [(len(levels) - 1) // 2, len(levels) // 2], side="right").sum()
     return float(counts[np.abs(np.arange(256) - median) <= _SHADE].sum() / len(levels))

@@ -49,7 +49,8 @@ class Evidence:
 
     Attributes:
         corners: number of the photo's corners that were looked for in the last render.
-        matches: number of those that were found; of feature matches where no pose was found.
+        matches: number of those that were found, of those where the render has a depth; of feature matches where no
+            pose was found.
         lifted: number of those that have a depth that can be trusted.
         inliers: number of those that agree with the pose; 0 without pose.
         inlier_ratio: share of the lifted ones that agrees, with some allowance for blur.

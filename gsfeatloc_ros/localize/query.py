@@ -20,8 +20,11 @@ from gsfeatloc_ros.localize.options import LocalizerOptions
 from gsfeatloc_ros.match.base import Matcher, Matches, Tracker
 from gsfeatloc_ros.pose.lift import Lifted, lift
 from gsfeatloc_ros.pose.readout import at_middle_row
-from gsfeatloc_ros.pose.solve import Correspondences, PoseSolution, solve_pose
+from gsfeatloc_ros.pose.solve import Correspondences, PoseSolution, solve_near, solve_pose
 from gsfeatloc_ros.render.base import Render, Renderer
+
+# Corners that are followed where the way is long.
+_ENOUGH_CORNERS = 200
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,15 +143,28 @@ class Query:
     def track(self, pose: np.ndarray, blur: Blur | None = None) -> MatchedView:
         """Do the same where the pose is nearly the photo's: track the photo's corners to the render instead.
 
-        The render is blurred by `blur`, as the photo is; None for a sharp one.
+        Corners where the render has no depth to trust are left out. It is blurred by `blur`, as the photo is; None for
+        a sharp one.
         """
         tracker, render = self.tracker, self.render(pose)
         with self.clock.stage("track"):
             image = render.device_image()
             if blur is not None:
                 image = cv2.filter2D(to_host(image), -1, blur.kernel)
-            matches = tracker.track(image)
+            matches = tracker.track(image, lambda pixels: self.lifted(pose, render, pixels).valid)
         return self._solve(pose, render, image, matches)
+
+    def track_from_afar(self, pose: np.ndarray) -> MatchedView:
+        """Do the same where the pose may be some way off: with fewer corners, which need not be where depth is."""
+        tracker, render = self.tracker, self.render(pose)
+        with self.clock.stage("track"):
+            image = render.device_image()
+            matches = tracker.track(image, _some)
+        return self._solve(pose, render, image, matches)
+
+    def lifted(self, pose: np.ndarray, render: Render, pixels: np.ndarray) -> Lifted:
+        """Return the points of the map under pixels (M, 2) of a render at a pose (4, 4)."""
+        return lift(render, self.photo.camera, pose, pixels, self.components.options.lift)
 
     def correspondences(self, pixels: np.ndarray, lifted: Lifted, pose: np.ndarray) -> Correspondences:
         """Return pixels (M, 2) of the photo with the points of the map there, where these could be lifted.
@@ -175,8 +191,15 @@ class Query:
     def _solve(self, pose: np.ndarray, render: Render, image: Array, matches: Matches) -> MatchedView:
         options, camera = self.components.options, self.photo.camera
         with self.clock.stage("solve"):
-            lifted = lift(render, camera, pose, matches.b, options.lift)
+            lifted = self.lifted(pose, render, matches.b)
             lifted_matches = matches.select(lifted.valid)
             found = self.correspondences(matches.a, lifted, pose)
-            solution = solve_pose(camera, found, options.pose, options.seed, self.plausible)
+            solution = solve_near(camera, pose, found, options.pose)
+            if solution is None or not self.plausible(solution.T_map_camera):
+                solution = solve_pose(camera, found, options.pose, options.seed, self.plausible)
         return MatchedView(pose, render, image, len(matches), lifted_matches, found, solution)
+
+
+def _some(pixels: np.ndarray) -> np.ndarray:
+    """Return which of pixels (N, 2) are enough to follow where they are all over the picture: (N,) bool."""
+    return np.arange(len(pixels)) % -(-len(pixels) // _ENOUGH_CORNERS or 1) == 0

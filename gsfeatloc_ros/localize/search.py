@@ -154,10 +154,10 @@ class Search:
         self._at_prior = True
         if not is_worth_tracking(render, camera, prior):
             return
-        view = self._small.track(prior.pose)
+        view = self._small.track_from_afar(prior.pose)
         if view.solution is not None and view.offset(camera) > _MAX_TRACKED_OFFSET * camera.width:
-            view = self._small.track(view.solution.T_map_camera)
-        if view.solution is not None and view.inliers >= CONFIRMED_HINT:
+            view = self._small.track_from_afar(view.solution.T_map_camera)
+        if view.solution is not None and view.inliers >= MIN_HINT:
             yield view.solution.T_map_camera
 
     def _hints(self, looked: list[MatchedView]) -> Iterator[np.ndarray]:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sized
+from collections.abc import Callable, Sized
 from dataclasses import dataclass
-from typing import Protocol, TypeVar
+from typing import Protocol, TypeAlias, TypeVar
 
 import numpy as np
 
@@ -69,6 +69,15 @@ class Matches:
         return Matches(np.empty((0, 2)), np.empty((0, 2)), np.empty(0))
 
 
+# Tells of pixels (N, 2) of a picture which are worth to be found in another: (N,) bool.
+Worth: TypeAlias = Callable[[np.ndarray], np.ndarray]
+
+
+def all_of_them(pixels: np.ndarray) -> np.ndarray:
+    """Return that all pixels (N, 2) are worth to be found."""
+    return np.ones(len(pixels), bool)
+
+
 class Tracker(Protocol):
     """Finds the corners of one photo in renders of nearly the same view.
 
@@ -79,11 +88,14 @@ class Tracker(Protocol):
     @property
     def corners(self) -> np.ndarray: ...
 
-    def track(self, image: Array) -> Matches:
-        """Find the photo's corners in a render (H, W, 3) uint8 RGB of its size; those that cannot be are left out."""
+    def track(self, image: Array, worth: Worth = all_of_them) -> Matches:
+        """Find the photo's corners in a render (H, W, 3) uint8 RGB of its size; those that cannot be are left out.
+
+        So may be, to save time, corners (N, 2) that are not `worth` it.
+        """
         ...
 
-    def track_back(self, image: Array) -> Matches:
+    def track_back(self, image: Array, worth: Worth = all_of_them) -> Matches:
         """Find the corners of a render in the photo; `a` of the matches are still the photo's pixels."""
         ...
 

@@ -10,7 +10,7 @@ import numpy as np
 from gsfeatloc_ros.common.arrays import Array, to_host
 from gsfeatloc_ros.common.local_structure import local_structure
 from gsfeatloc_ros.common.photo import Photo
-from gsfeatloc_ros.match.base import Matches
+from gsfeatloc_ros.match.base import Matches, Worth, all_of_them
 
 # Corners (Shi and Tomasi, 1994): how many, how many pixels apart, of what part of the strongest one's strength, and
 # over a block of how many pixels a side that is measured.
@@ -27,7 +27,7 @@ STRUCTURE_GAIN = 40.0
 # Lucas-Kanade on a pyramid whose levels are 0 to this, in windows of these pixels.
 FLOW_WINDOW = (15, 15)
 MAX_FLOW_LEVEL = 3
-_FLOW_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.01)
+_FLOW_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.03)
 # Of a corner that is followed to the render and back, in pixels.
 MAX_RETURN_ERROR = 1.0
 
@@ -49,18 +49,22 @@ class CornerTracker:
         self.corners = _find_corners(gray, MAX_CORNERS, seen_off_the_border(photo))
         self._last_render: _Seen | None = None
 
-    def track(self, image: Array) -> Matches:
-        """Find the photo's corners in a render (H, W, 3) uint8 RGB of its size.
+    def track(self, image: Array, worth: Worth = all_of_them) -> Matches:
+        """Find the photo's corners that are `worth` it in a render (H, W, 3) uint8 RGB of its size.
 
         Corners that cannot be followed there and back are left out.
         """
-        return _there_and_back(self._structure, self._see(image).structure, self.corners)
+        corners = self.corners[worth(self.corners)]
+        return _there_and_back(self._structure, self._see(image).structure, corners)
 
-    def track_back(self, image: Array) -> Matches:
-        """Find the corners of a render (H, W, 3) uint8 RGB in the photo; `a` of the matches are the photo's pixels."""
+    def track_back(self, image: Array, worth: Worth = all_of_them) -> Matches:
+        """Find the corners of a render (H, W, 3) uint8 RGB that are `worth` it in the photo.
+
+        `a` of the matches are the photo's pixels.
+        """
         render = self._see(image)
         corners = _find_corners(render.gray, MAX_RENDER_CORNERS, None)
-        return _there_and_back(render.structure, self._structure, corners).swapped()
+        return _there_and_back(render.structure, self._structure, corners[worth(corners)]).swapped()
 
     def _see(self, image: Array) -> _Seen:
         """Return what a render looks like; that of the last one is kept, as it is tracked both ways."""
@@ -106,7 +110,7 @@ def _there_and_back(here: np.ndarray, there: np.ndarray, corners: np.ndarray) ->
 def _structure(gray: np.ndarray) -> np.ndarray:
     """Return the local structure of brightness (H, W) uint8 as bytes (H, W)."""
     structure, _ = local_structure(gray, STRUCTURE_SIGMA, STRUCTURE_MIN_CONTRAST)
-    return np.clip(128 + STRUCTURE_GAIN * structure, 0, 255).astype(np.uint8)
+    return cv2.addWeighted(structure, STRUCTURE_GAIN, structure, 0, 128, dtype=cv2.CV_8U)
 
 
 def _flow(here: np.ndarray, there: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

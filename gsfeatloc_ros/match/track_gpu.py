@@ -13,7 +13,7 @@ from torch.nn.functional import avg_pool2d, conv2d, grid_sample, max_pool2d, pad
 
 from gsfeatloc_ros.common.arrays import Array, to_device, to_host
 from gsfeatloc_ros.common.photo import Photo
-from gsfeatloc_ros.match.base import Matches
+from gsfeatloc_ros.match.base import Matches, Worth, all_of_them
 from gsfeatloc_ros.match.tensor import LUMA
 from gsfeatloc_ros.match.track import (
     CORNER_BLOCK,
@@ -72,10 +72,10 @@ class GpuCornerTracker:
                 self._templates = [level.templates(self._pixels) for level in self._pyramid]
 
     @torch.inference_mode()
-    def track(self, image: Array) -> Matches:
+    def track(self, image: Array, worth: Worth = all_of_them) -> Matches:
         """Find the photo's corners in a render (H, W, 3) uint8 RGB of its size.
 
-        Corners that cannot be followed there and back are left out.
+        Corners that cannot be followed there and back are left out. None takes time of its own: `worth` is not asked.
         """
         if len(self.corners) == 0:
             return Matches.none()
@@ -90,7 +90,7 @@ class GpuCornerTracker:
         pixels = self.corners[kept].astype(np.float64)
         return Matches(pixels, np.column_stack([x, y])[kept].astype(np.float64), np.ones(len(pixels)))
 
-    def track_back(self, image: Array) -> Matches:
+    def track_back(self, image: Array, worth: Worth = all_of_them) -> Matches:
         """Find the corners of a render (H, W, 3) uint8 RGB in the photo; `a` of the matches are the photo's pixels."""
         render = Photo(to_host(image), np.ones(self._photo.seen.shape, bool), self._photo.camera)
         return GpuCornerTracker(render, self._device).track(self._photo.image).swapped()

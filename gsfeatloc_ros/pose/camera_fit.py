@@ -92,15 +92,17 @@ def fit_camera(
 
 
 def _fit(camera: Camera, calibrated: _State, found: Correspondences, options: PoseOptions) -> CameraFit:
-    free = _Problem.seen_from(calibrated, camera, found, options).solve(calibrated, _ANY_CAMERA)
+    problem = _Problem.seen_from(calibrated, camera, found, options)
+    free = problem.solve(problem.at(calibrated), _ANY_CAMERA)
     # The keypoints' noise is what is left once the camera's errors are explained.
     problem = _Problem.seen_from(free, camera, found, options)
-    sigmas = np.sqrt(np.maximum(np.diag(problem.covariance(problem.at(free), _ANY_CAMERA))[6:], 0.0))
+    system = problem.at(free)
+    sigmas = np.sqrt(np.maximum(np.diag(problem.covariance(system, problem.field(system), _ANY_CAMERA))[6:], 0.0))
     excess = np.sqrt(np.maximum(free.camera**2 - sigmas**2, 0.0))
-    kept = problem.solve(free, np.clip(np.where(_CONTRADICTED, excess, 0.0), _EXACT, _ANY_CAMERA))
+    kept = problem.solve(system, np.clip(np.where(_CONTRADICTED, excess, 0.0), _EXACT, _ANY_CAMERA))
     # What a calibration in use would move the pose by is not known better than that.
     system = problem.at(kept)
-    shift = system.step(_CALIBRATED)[:6]
+    shift, field = system.step(_CALIBRATED)[:6], problem.field(system)
     return CameraFit(
         focal=float(free.camera[0]),
         focal_sigma=float(sigmas[0]),
@@ -109,9 +111,9 @@ def _fit(camera: Camera, calibrated: _State, found: Correspondences, options: Po
         rolling=free.camera[2:],
         rolling_sigma=sigmas[2:],
         T_map_camera=kept.pose,
-        covariance=problem.covariance(system, _CALIBRATED)[:6, :6] + np.outer(shift, shift),
+        covariance=problem.covariance(system, field, _CALIBRATED)[:6, :6] + np.outer(shift, shift),
         followed=kept.camera,
-        field=problem.field(system),
+        field=field,
     )
 
 
@@ -171,23 +173,23 @@ class _Problem:
             raise _BehindCameraError
         return cls(camera, found, whitening, options)
 
-    def solve(self, start: _State, deviations: np.ndarray) -> _State:
-        """Return the most likely state."""
-        state = start
+    def solve(self, system: _System, deviations: np.ndarray) -> _State:
+        """Return the most likely state, from the problem at one near it."""
         for _ in range(_MAX_ITERATIONS):
-            step = self.at(state).step(deviations)
-            state = state.moved(step)
+            step = system.step(deviations)
+            state = system.state.moved(step)
             if np.abs(step[6:] / _ANY_CAMERA).max() < _MIN_STEP:
                 break
+            system = self.at(state)
         return state
 
-    def covariance(self, system: _System, deviations: np.ndarray) -> np.ndarray:
+    def covariance(self, system: _System, field: ResidualField, deviations: np.ndarray) -> np.ndarray:
         """Return the covariance (11, 11) of pose and camera, with what the matches have in common, as of a pose."""
         known, weights = np.diag(_information(deviations)), system.weights
         inflation = max((weights * system.squared).sum() / max(2 * weights.sum() - len(known), 1.0), 1.0)
         weighted = (weights[:, None, None] * system.jacobian).reshape(-1, len(known))
         of_a_match = weighted.T @ system.jacobian.reshape(-1, len(known)) / weights.sum()
-        shared = shared_variance(self.calibrated, self.field(system), self.options)
+        shared = shared_variance(self.calibrated, field, self.options)
         # What they have in common counts as one match with that error, beside what is known before.
         return inflation * np.linalg.inv(system.hessian + known) + np.linalg.inv(of_a_match / shared + known)
 
@@ -221,7 +223,7 @@ def _when(camera: Camera, found: Correspondences) -> np.ndarray:
 def _in_camera(camera: Camera, pose: np.ndarray, extra: np.ndarray, found: Correspondences) -> np.ndarray:
     """Return the points (M, 3) in the camera frame as their rows are read: it has turned by then, by small angles."""
     in_camera = (found.points - pose[:3, 3]) @ pose[:3, :3]
-    return in_camera - np.cross(_when(camera, found) * extra[2:], in_camera)
+    return in_camera - _when(camera, found) * (in_camera @ skew(extra[2:]).T)
 
 
 def _linearize(

@@ -23,7 +23,9 @@ MIN_POINTS = 4
 # Keypoints are no better than this, however well a few of them happen to agree.
 _MIN_PIXEL_SIGMA = 0.1
 _REFINE_ITERATIONS = 20
-_NOISE_ITERATIONS = 5
+_NOISE_ITERATIONS = 4
+# A pose is that of the matches where more than half of them are off by at most this many pixels.
+_MAX_NEAR_ERROR = 1.0
 # Poses that are not plausible are passed over, with their inliers, this many times.
 _MAX_IMPLAUSIBLE_POSES = 3
 # A step that lowers the cost by less than this share ends the refinement: a thousandth of a standard deviation is left.
@@ -122,21 +124,42 @@ def solve_pose(
     return first
 
 
+def solve_near(
+    camera: Camera, T_map_camera: np.ndarray, found: Correspondences, options: PoseOptions
+) -> PoseSolution | None:
+    """Find the pose as solve_pose does, without sampling, where most matches agree with one that is known.
+
+    No other pose can have more of them. None where a pose (4, 4) is off from most matches by more than a pixel.
+    """
+    errors = reprojection_errors(camera, T_map_camera, found)
+    if len(errors) < MIN_POINTS or np.median(errors) > _MAX_NEAR_ERROR:
+        return None
+    agreeing = np.flatnonzero(errors <= options.max_reprojection_error)
+    return _refined(camera, T_map_camera, found, agreeing, options)
+
+
 def _solve(
     camera: Camera, found: Correspondences, among: np.ndarray, options: PoseOptions, seed: int
 ) -> PoseSolution | None:
     """Return the pose that most of the matches of indices `among` (N,) agree on, or None; errors are those of all."""
-    candidates = found.select(among)
-    sampled = ransac_pose(camera, candidates, options.max_reprojection_error, seed)
+    sampled = ransac_pose(camera, found.select(among), options.max_reprojection_error, seed)
     if sampled is None:
         return None
     start, agreeing = sampled
-    refined = refine_pose(camera, start, candidates.select(agreeing), options)
+    solution = _refined(camera, start, found, among[agreeing], options)
+    return solution if solution and solution.inliers[among].sum() >= MIN_POINTS else None
+
+
+def _refined(
+    camera: Camera, start: np.ndarray, found: Correspondences, agreeing: np.ndarray, options: PoseOptions
+) -> PoseSolution | None:
+    """Return the pose on which matches of indices `agreeing` (N,) agree, from one near it (4, 4); errors are of all."""
+    refined = refine_pose(camera, start, found.select(agreeing), options)
     if refined is None:
         return None
     errors = reprojection_errors(camera, refined[0], found)
     inliers = errors <= options.max_reprojection_error
-    if inliers[among].sum() < MIN_POINTS:
+    if inliers.sum() < MIN_POINTS:
         return None
     return PoseSolution(*refined, errors, inliers, float(np.sqrt(np.mean(errors[inliers] ** 2))))
 
@@ -328,18 +351,18 @@ def _whitening(residuals: np.ndarray, smears: np.ndarray) -> np.ndarray:
     A covariance is the smear (M, 2) of the point's uncertainty, in pixels, and the keypoints' noise, which is chosen so
     that the median whitened residual is as long as a Gaussian's. W shortens what lies along the smear.
     """
-    smear_covariances = smears[:, :, None] * smears[:, None, :]
-    squares = (smears**2).sum(axis=1)
+    lengths, squares = (residuals**2).sum(axis=1), (smears**2).sum(axis=1)
+    along = (smears * residuals).sum(axis=1) ** 2
     # Of a 2D Gaussian, the median of the squared length is 2 ln 2 variances.
-    median_of_unit = 2 * np.log(2)
-    noise = np.median((residuals**2).sum(axis=1)) / median_of_unit
+    noise = np.median(lengths) / (2 * np.log(2))
     for _ in range(_NOISE_ITERATIONS):
         noise = max(noise, _MIN_PIXEL_SIGMA**2)
-        # The inverse square root of noise * I + smear smear^T.
-        along = (1.0 - np.sqrt(noise / (noise + squares))) / np.maximum(squares, np.finfo(float).tiny)
-        whitening = (np.eye(2) - along[:, None, None] * smear_covariances) / np.sqrt(noise)
-        noise *= np.median((_apply(whitening, residuals) ** 2).sum(axis=1)) / median_of_unit
-    return whitening
+        # The squared whitened length times the noise, by the inverse of noise * I + smear smear^T.
+        noise = np.median(lengths - along / (noise + squares)) / (2 * np.log(2))
+    noise = max(noise, _MIN_PIXEL_SIGMA**2)
+    # The inverse square root of noise * I + smear smear^T.
+    shortened = (1.0 - np.sqrt(noise / (noise + squares))) / np.maximum(squares, np.finfo(float).tiny)
+    return (np.eye(2) - shortened[:, None, None] * (smears[:, :, None] * smears[:, None, :])) / np.sqrt(noise)
 
 
 def _apply(matrices: np.ndarray, vectors: np.ndarray) -> np.ndarray:

@@ -8,6 +8,7 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import Protocol, TypeAlias
 
+import cv2
 import numpy as np
 
 from gsfeatloc_ros.common.arrays import Array, to_host
@@ -85,8 +86,9 @@ class Render:
 
     def device_image(self) -> Array:
         """Return the colours as an 8-bit RGB image (H, W, 3), where they were drawn."""
-        levels = (self.rgb * 255.0).round()
-        return levels.astype(np.uint8) if isinstance(levels, np.ndarray) else levels.byte()
+        if isinstance(self.rgb, np.ndarray):
+            return cv2.convertScaleAbs(self.rgb, alpha=255.0)
+        return (self.rgb * 255.0).round().byte()
 
     def image(self) -> np.ndarray:
         """Return the colours as an 8-bit RGB image (H, W, 3), on the host."""

@@ -12,7 +12,6 @@ import torch
 from pictures import photo_of, smooth_noise
 from stand_in.gpu import simulated_gpu
 
-from gsfeatloc_ros.common.local_structure import local_structure
 from gsfeatloc_ros.match.track import (
     MAX_CORNERS,
     MIN_CORNER_DISTANCE,
@@ -103,8 +102,10 @@ def test_the_border_of_what_the_lens_saw_is_no_corner() -> None:
 
 def test_the_pyramid_is_of_local_structure_and_opencvs_halvings() -> None:
     photo = photo_of(smooth_noise(2, 151, 233))
-    structure = STRUCTURE_GAIN * local_structure(photo.gray(), STRUCTURE_SIGMA, STRUCTURE_MIN_CONTRAST)[0]
-    expected = np.clip(structure, -128, 128)
+    gray = photo.gray().astype(np.float32)
+    centred = gray - cv2.GaussianBlur(gray, (0, 0), STRUCTURE_SIGMA)
+    contrast = np.sqrt(cv2.GaussianBlur(centred**2, (0, 0), STRUCTURE_SIGMA))
+    expected = np.clip(STRUCTURE_GAIN * centred / np.maximum(contrast, STRUCTURE_MIN_CONTRAST), -128, 128)
     for level in GpuCornerTracker(photo, "cpu")._pyramid:
         # Where brightness is half-way between two whole numbers OpenCV may take the other.
         np.testing.assert_allclose(level.structure[0, 0], expected, atol=5.0)

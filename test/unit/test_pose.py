@@ -13,6 +13,7 @@ from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.geometry import (
     invert,
     make_pose,
+    moved,
     rotation_error_deg,
     so3_exp,
     so3_log,
@@ -29,6 +30,7 @@ from gsfeatloc_ros.pose.solve import (
     refine_pose,
     reprojection_errors,
     shared_variance,
+    solve_near,
     solve_pose,
 )
 from gsfeatloc_ros.render.base import Render
@@ -282,3 +284,13 @@ def test_refinement_refuses_points_behind_the_camera() -> None:
     found, _ = scene(0)
     found.points[0] = transform(POSE, np.array([[0, 0, -1.0]]))[0]
     assert refine_pose(CAMERA, POSE, found, PoseOptions()) is None
+
+
+def test_near_the_pose_it_is_solved_for_without_sampling() -> None:
+    found, _ = scene(0, noise=0.3, outliers=0.2)
+    sampled = solve_pose(CAMERA, found, PoseOptions(), seed=0)
+    near = solve_near(CAMERA, moved(POSE, np.full(6, 2e-4)), found, PoseOptions())
+    np.testing.assert_allclose(near.T_map_camera, sampled.T_map_camera, atol=1e-4)
+    np.testing.assert_allclose(np.diag(near.covariance), np.diag(sampled.covariance), rtol=0.1)
+    assert solve_near(CAMERA, moved(POSE, np.full(6, 0.05)), found, PoseOptions()) is None
+    assert solve_near(CAMERA, POSE, found.select(np.zeros(0, int)), PoseOptions()) is None

@@ -131,3 +131,13 @@ def test_structure_does_not_know_brightness_and_contrast(gain: float, offset: fl
     changed = np.rint(gain * gray + offset).astype(np.uint8)
     a, b = (local_structure(image, 6.0, 2.0)[0] for image in (gray, changed))
     assert np.corrcoef(a.ravel(), b.ravel())[0, 1] > 0.99
+
+
+def test_only_what_is_worth_it_is_looked_for() -> None:
+    image = smooth_noise(5)
+    tracker = CornerTracker(photo_of(image))
+    matches = tracker.track(image, lambda pixels: pixels[:, 0] < 80)
+    assert 0 < len(matches) < len(tracker.track(image))
+    assert (matches.a[:, 0] < 80).all()
+    assert (tracker.track_back(image, lambda pixels: pixels[:, 1] < 60).b[:, 1] < 60).all()
+    assert len(tracker.track(image, lambda pixels: np.zeros(len(pixels), bool))) == 0
