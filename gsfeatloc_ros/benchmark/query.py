@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from gsfeatloc_ros.benchmark.measure import spread, stage_time, timed
+from gsfeatloc_ros.benchmark.measure import Timed, spread, stage_time, timed
 from gsfeatloc_ros.evaluate.protocol import make_priors, paper_prior_error
 from gsfeatloc_ros.evaluate.scene import load_scene, load_scene_renderer
 from gsfeatloc_ros.localize.engine import load_matcher
+from gsfeatloc_ros.localize.estimate import Estimate
 from gsfeatloc_ros.localize.localizer import Localizer
 from gsfeatloc_ros.localize.settings import MatcherSettings, RendererSettings
 
@@ -37,12 +39,14 @@ def measure_queries(scene_path: Path, matcher_name: str, sigma: float, device: s
     ]
     localizer.localize(*queries[0])  # what is compiled or loaded at the first call does not count
     done = [timed(localizer.localize, *query) for query in queries]
+    return {"scene": scene.name, "matcher": matcher_name, "sigma": sigma, **times_of(done, clock)}
+
+
+def times_of(done: Sequence[Timed[Estimate]], clock: str) -> dict[str, Any]:
+    """Return the times of localizations as measure_queries does; `clock` is that of the stages, "cpu" or "wall"."""
     stages = {name for query in done for name in query.result.milliseconds} - {"total"}
     by_stage = {name: float(np.median([query.result.milliseconds.get(name, 0.0) for query in done])) for name in stages}
     return {
-        "scene": scene.name,
-        "matcher": matcher_name,
-        "sigma": sigma,
         "photos": len(done),
         "localized": sum(query.result.localized for query in done),
         "passes": float(np.mean([query.result.evidence.passes for query in done])),
@@ -55,8 +59,13 @@ def measure_queries(scene_path: Path, matcher_name: str, sigma: float, device: s
 
 def print_queries(report: dict[str, Any]) -> None:
     """Print what measure_queries found."""
+    print_times(f"{report['scene']}, {report['matcher']}", report)
+
+
+def print_times(title: str, report: dict[str, Any]) -> None:
+    """Print what times_of found."""
     print(
-        f"{report['scene']}, {report['matcher']}: {report['localized']} of {report['photos']} photos localized, "
+        f"{title}: {report['localized']} of {report['photos']} photos localized, "
         f"{report['passes']:.1f} passes and {report['views']:.1f} other views each"
     )
     for name in ("cpu", "wall"):

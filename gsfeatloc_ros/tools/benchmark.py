@@ -5,6 +5,7 @@
     gsfeatloc benchmark render --scene SCENE
     gsfeatloc benchmark opensplat --map map.ply --checkout OpenSplat
     gsfeatloc benchmark query --scene SCENE --matcher xfeat --json query.json
+    gsfeatloc benchmark track --scene SCENE --json track.json
     gsfeatloc benchmark scaling --out scaling.png
     gsfeatloc benchmark index --out index.png
     gsfeatloc benchmark twins --share 0,0.02 --photos 200
@@ -27,6 +28,7 @@ from gsfeatloc_ros.benchmark.measure import machine
 from gsfeatloc_ros.benchmark.pnp import measure_pnp
 from gsfeatloc_ros.benchmark.query import measure_queries, print_queries
 from gsfeatloc_ros.benchmark.scaling import COUNTS, draw_scaling, measure_scaling
+from gsfeatloc_ros.benchmark.track import measure_tracking, print_tracking
 from gsfeatloc_ros.benchmark.twins import measure_twins, twins_table
 from gsfeatloc_ros.common.geometry import pose_from_numbers, quaternion_from_matrix
 from gsfeatloc_ros.evaluate.scene import load_scene
@@ -102,6 +104,13 @@ def make_parser() -> argparse.ArgumentParser:
         "--sigma", type=float, default=1.0, help="scale of the priors' errors; 1 as in the paper (default: %(default)s)"
     )
     query.set_defaults(run=_query)
+
+    track = commands.add_parser(
+        "track", parents=[device, file], help="time of a localization, by stage, whose prior is good: small motion"
+    )
+    track.add_argument("--scene", type=Path, required=True, help="folder with a map and photos")
+    track.add_argument("--frames", type=int, default=60, help="along the simulated path (default: %(default)s)")
+    track.set_defaults(run=_track)
 
     synthetic = commands.add_parser("synthetic", help="make a map of two rooms to measure on")
     synthetic.add_argument("--gaussians", type=int, default=1_000_000, help="their number (default: %(default)s)")
@@ -187,6 +196,15 @@ def _check_frames(options: argparse.Namespace) -> None:
 def _query(options: argparse.Namespace) -> None:
     report = measure_queries(options.scene, options.matcher, options.sigma, options.device, options.threads)
     print_queries(report)
+    _write(options.json, report | {"device": options.device, "threads": options.threads})
+
+
+def _track(options: argparse.Namespace) -> None:
+    if options.frames < 1:
+        raise ValueError("--frames must be at least 1")
+    settings = RendererSettings(device=options.device, threads=options.threads)
+    report = measure_tracking(options.scene, options.frames, settings)
+    print_tracking(report)
     _write(options.json, report | {"device": options.device, "threads": options.threads})
 
 

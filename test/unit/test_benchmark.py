@@ -153,6 +153,18 @@ def test_query_is_split_into_stages(scene, tmp_path, capsys):
 
 
 @pytest.mark.slow
+def test_tracking_is_measured_near_the_photos_and_along_a_path(scene, tmp_path, capsys):
+    report = measured(tmp_path, "track", "--scene", scene, "--frames", "3")
+    assert (report["near"]["photos"], report["path"]["photos"]) == (2, 2)
+    assert report["near"]["localized"] == report["path"]["localized"] == 2
+    for part in ("near", "path"):
+        assert {"render", "track", "solve"} <= report[part]["stages_cpu_ms"].keys()
+        assert "features" not in report[part]["stages_cpu_ms"]
+    assert report["path"]["max_error_deg"] < 0.2
+    assert "along a path: 2 of 2 photos localized" in capsys.readouterr().out
+
+
+@pytest.mark.slow
 def test_scaling_measures_every_value_and_draws_it(tmp_path):
     rows = measure_scaling([1000, 2000])
     values = {varied: {row["value"] for row in rows if row["varied"] == varied} for varied in ("gaussians", "pixels")}
@@ -190,6 +202,8 @@ def test_outcomes_of_twins_are_counted_by_what_differs():
         (["render", "--map", "/nowhere/map.ply"], "/nowhere/map.ply"),
         (["render", "--scene", "/nowhere"], "/nowhere"),
         (["query", "--scene", "/nowhere"], "/nowhere"),
+        (["track", "--scene", "/nowhere"], "/nowhere"),
+        (["track", "--scene", "/nowhere", "--frames", "0"], "--frames"),
         (["render", "--map", "MAP", "--frames", "0"], "--frames"),
         (["render", "--map", "MAP", "--pose", "0", "0", "0", "0", "0", "0", "0"], "quaternion"),
         (["render", "--scene", "MAP", "--pose", "0", "0", "0", "0", "0", "0", "1"], "--pose"),
