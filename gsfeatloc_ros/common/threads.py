@@ -56,14 +56,20 @@ class Cores:
     """
 
     def __init__(self, count: int) -> None:
-        self._count = count
+        self._count, self._limited = count, 0 < count < len(os.sched_getaffinity(0))
         self._lock = threading.Lock()
         self._users = 0
         self._before: dict[int, set[int]] = {}
 
     @contextmanager
     def in_background(self) -> Iterator[None]:
-        """Work in this thread, and in those that it starts, beside the others: they go first, on the same cores."""
+        """Work in this thread, and in those that it starts, beside the others: they go first, on the same cores.
+
+        Where there are no more cores than it may take, the kernel alone says who goes first.
+        """
+        if not self._limited:
+            yield
+            return
         thread = threading.get_native_id()
         os.setpriority(os.PRIO_PROCESS, thread, os.getpriority(os.PRIO_PROCESS, thread) + _NICENESS)
         with self._lock:
@@ -80,8 +86,6 @@ class Cores:
 
     def _share(self) -> None:
         allowed = os.sched_getaffinity(0)
-        if not 0 < self._count < len(allowed):
-            return
         # Those on which the threads are that have worked most: where cores differ, the kernel has found the fast ones.
         busiest = sorted(map(_work_and_core, _threads()), reverse=True)
         cores = list(dict.fromkeys([core for _, core in busiest if core in allowed] + sorted(allowed)))
@@ -90,11 +94,9 @@ class Cores:
             _allow(thread, set(cores[: self._count]))
 
     def _part(self) -> None:
-        if self._before:
-            everywhere = set[int]().union(*self._before.values())
-            for thread in _threads():
-                _allow(thread, self._before.get(thread, everywhere))
-        self._before = {}
+        everywhere = set[int]().union(*self._before.values())
+        for thread in _threads():
+            _allow(thread, self._before.get(thread, everywhere))
 
 
 def _threads() -> list[int]:

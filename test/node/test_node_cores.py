@@ -11,6 +11,7 @@ from node_harness import connected_client, running_localizer, send_inputs
 from sensor_msgs.msg import PointCloud2
 
 from gsfeatloc_ros.client.observer import Sample
+from gsfeatloc_ros.client.process import START_TIMEOUT
 
 # Seconds over which the time is counted, and most cores that may be taken meanwhile.
 SECONDS = 5.0
@@ -39,7 +40,7 @@ def test_one_core_is_enough_whatever_it_does(room_map_file, room_camera, photo, 
     }
     taken = {}
     with running_localizer(**parameters) as process, connected_client() as client:
-        process.wait_for_output(r"building the view index: \d+ of \d+ views")
+        process.wait_for_output(r"building the view index: \d+ of \d+ views", START_TIMEOUT)
         taken["index"] = cores(process, client)
         send_inputs(client, room_camera, photo)
         with running_camera(tmp_path / "picture.npy"):
