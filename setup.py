@@ -13,6 +13,8 @@ evaluate = [
     "pycolmap>=4.0,<5",  # the first that adds an image with its pose in one step
 ]
 superpoint = ["transformers>=5.0,<6"]
+# The page of the tool `view`; the last two are what it is made of, and used themselves.
+view = ["viser>=1.1.1,<1.2", "trimesh>=4,<6", "websockets>=14,<17"]
 
 # What `ros2 run gsfeatloc_ros NAME` finds, where colcon or bloom installs. A wheel would put names as common as `index`
 # into a user's bin: there they are subcommands of gsfeatloc alone.
@@ -29,6 +31,7 @@ tools = [
     "render",
     "replay",
     "soak",
+    "view",
     "warmup",
 ]
 for_ros = {"install", "develop"} & set(sys.argv)
@@ -113,11 +116,13 @@ setup(
         "evaluate": evaluate,
         # The matchers superpoint-superglue and superpoint-lightglue. Their weights are for noncommercial research only.
         "superpoint": superpoint,
+        "view": view,
         # The documents as a site: make docs.
         "docs": ["mkdocs-material>=9.6,<10"],
         "test": [
             *evaluate,
             *superpoint,
+            *view,
             "hypothesis>=6.100,<7",
             "mypy>=1.13,<2",
             "pytest>=8,<9",

@@ -20,8 +20,8 @@ from gsfeatloc_ros.common.tum import tum_fields
 
 # Hours of odometry at 200 Hz.
 _MAX_BYTES = 500_000_000
-_POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
-_VARIANCES = ("var_x", "var_y", "var_z", "var_rx", "var_ry", "var_rz")
+POSE_FIELDS = ("x", "y", "z", "qx", "qy", "qz", "qw")
+VARIANCE_FIELDS = ("var_x", "var_y", "var_z", "var_rx", "var_ry", "var_rz")
 # Nanoseconds. Stamps beyond these fit in no message.
 _MAX_STAMP = 2**63
 
@@ -32,7 +32,7 @@ def read_answers(path: Path) -> list[Answer]:
     Raises:
         ValueError: the file cannot be read, a line is no pose, or there is none; the message says which.
     """
-    lines = _lines(path)
+    lines = read_lines(path)
     if lines[0].startswith("stamp,"):
         answers = [_answer(path, number, row) for number, row in enumerate(csv.DictReader(lines), start=2) if row["x"]]
     else:
@@ -48,13 +48,14 @@ def read_tum(path: Path) -> list[tuple[int, np.ndarray]]:
     Raises:
         ValueError: as of read_answers.
     """
-    poses = list(_tum(path, _lines(path)))
+    poses = list(_tum(path, read_lines(path)))
     if not poses:
         raise ValueError(f"{path}: holds no pose")
     return poses
 
 
-def _lines(path: Path) -> list[str]:
+def read_lines(path: Path) -> list[str]:
+    """Return the lines of a text file; raise ValueError where it cannot be read, is no text or is empty."""
     try:
         lines = read_regular(path, _MAX_BYTES).decode("utf-8-sig").splitlines()
     except OSError as error:
@@ -70,13 +71,13 @@ def _lines(path: Path) -> list[str]:
 
 def _tum(path: Path, lines: Sequence[str]) -> Iterator[tuple[int, np.ndarray]]:
     for number, fields in tum_fields(lines):
-        yield _stamped(path, number, fields)
+        yield stamped_pose(path, number, fields)
 
 
 def _answer(path: Path, number: int, row: dict[str, str | None]) -> Answer:
-    stamp, pose = _stamped(path, number, [row.get(name) or "" for name in ("stamp", *_POSE)])
+    stamp, pose = stamped_pose(path, number, [row.get(name) or "" for name in ("stamp", *POSE_FIELDS)])
     try:
-        variances = np.array([float(row.get(name) or 0.0) for name in _VARIANCES])
+        variances = np.array([float(row.get(name) or 0.0) for name in VARIANCE_FIELDS])
     except ValueError as error:
         raise ValueError(f"{path}: line {number} has variances that are no numbers") from error
     if not (np.isfinite(variances).all() and variances.min() >= 0):
@@ -84,8 +85,8 @@ def _answer(path: Path, number: int, row: dict[str, str | None]) -> Answer:
     return Answer(stamp, pose, variances.reshape(2, 3).mean(axis=1))
 
 
-def _stamped(path: Path, number: int, fields: Sequence[str]) -> tuple[int, np.ndarray]:
-    """Return stamp and pose of a line's fields."""
+def stamped_pose(path: Path, number: int, fields: Sequence[str]) -> tuple[int, np.ndarray]:
+    """Return stamp in nanoseconds and pose of a line's fields; raise ValueError where they are none."""
     try:
         stamp = Decimal(fields[0]) * 10**9
         if not abs(stamp) < _MAX_STAMP:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
@@ -13,12 +13,17 @@ TIMEOUT = 60.0
 
 
 class ClientNode:
-    """A node in a context of its own, whose messages are taken while somebody waits for something."""
+    """A node in a context of its own, whose messages are taken while somebody waits for something.
 
-    def __init__(self, name: str) -> None:
+    Args:
+        name, namespace: of the node.
+        arguments: of ROS: --ros-args with remappings.
+    """
+
+    def __init__(self, name: str, namespace: str = "", arguments: Sequence[str] = ()) -> None:
         self._context = rclpy.Context()
-        rclpy.init(context=self._context)
-        self.node = rclpy.create_node(name, context=self._context)
+        rclpy.init(args=list(arguments), context=self._context)
+        self.node = rclpy.create_node(name, context=self._context, namespace=namespace)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self.node)
 

@@ -33,5 +33,10 @@ def point_cloud(gaussian_map: GaussianMap, count: int) -> PointCloud:
     count = min(count, len(weights))
     chosen = np.argpartition(weights, len(weights) - count)[len(weights) - count :]
     points = gaussian_map.S_map_splat.transform(gaussian_map.means[chosen].astype(np.float64))
-    levels = 0.5 + SH_C0 * gaussian_map.sh[chosen, 0].astype(np.float32)
-    return PointCloud(points.astype(np.float32), np.rint(255 * np.clip(levels, 0, 1)).astype(np.uint8))
+    return PointCloud(points.astype(np.float32), seen_colours(gaussian_map, chosen))
+
+
+def seen_colours(gaussian_map: GaussianMap, rows: np.ndarray) -> np.ndarray:
+    """Return how Gaussians by their rows (n,) look from all sides: (n, 3) uint8 RGB."""
+    levels = 0.5 + SH_C0 * gaussian_map.sh[rows, 0].astype(np.float32)
+    return np.rint(255 * np.clip(levels, 0, 1)).astype(np.uint8)

@@ -16,6 +16,7 @@ from functools import partial
 # Names of the tools, modules of this room with `main` and `make_parser`, and what they are for.
 TOOLS = {
     "inspect": "say what is in a map, and what of it looks wrong for localization",
+    "view": "fly through a map in the browser: answers in it, priors, floor and scale",
     "render": "draw a map from a pose or a path: pictures, depths, a video",
     "index": "make the index of a map's views, which finds images without a prior",
     "prepare": "put a map and all that a robot needs of it into one folder",

@@ -6,9 +6,10 @@ import argparse
 import math
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
-from gsfeatloc_ros.common.parameter import parameters_of
+from gsfeatloc_ros.common.parameter import Value, parameters_of, values_of
 from gsfeatloc_ros.localize.options import LocalizerOptions
 from gsfeatloc_ros.localize.settings import MapSettings
 from gsfeatloc_ros.maps import ReadOptions
@@ -127,6 +128,13 @@ def map_settings(options: argparse.Namespace) -> MapSettings:
         dataparser_transforms=options.dataparser_transforms,
         reading=ReadOptions(options.map_antialiased, options.map_spz_axes, options.map_level),
     )
+
+
+def given_map(options: argparse.Namespace) -> dict[str, Value]:
+    """Return the node's parameters map.* that options name: those that are not the default."""
+    default = values_of(MapSettings(), "map.")
+    named = replace(map_settings(options), path=str(options.map or ""))
+    return {name: value for name, value in values_of(named, "map.").items() if value != default[name]}
 
 
 def add_old_name(parser: argparse.ArgumentParser, option: argparse.Action, old: str) -> None:

@@ -22,7 +22,6 @@ from pathlib import Path
 from tqdm import tqdm
 
 from gsfeatloc_ros.common.kernel_cache import can_write
-from gsfeatloc_ros.common.parameter import values_of
 from gsfeatloc_ros.common.replaced_file import replaced_file
 from gsfeatloc_ros.common.safe_files import open_regular
 from gsfeatloc_ros.index.storage import index_path
@@ -36,7 +35,7 @@ from gsfeatloc_ros.render.cache import SUFFIX
 from gsfeatloc_ros.ros_io.parameter_file import read_parameter_file
 from gsfeatloc_ros.ros_io.settings import Settings
 from gsfeatloc_ros.tools.index import add_index_options, make_index, matcher_settings, training_poses
-from gsfeatloc_ros.tools.options import add_map_options, map_settings, print_reading
+from gsfeatloc_ros.tools.options import add_map_options, given_map, print_reading
 from gsfeatloc_ros.tools.status import run_tool
 
 _COPIED_AT_ONCE = 1 << 24
@@ -83,11 +82,10 @@ def _given(options: argparse.Namespace) -> MapSettings:
     for name in values:
         if not name.startswith("map."):
             raise ValueError(f"{options.align}: {name} is not of a map: a bundle takes the parameters map.* alone")
-    aligned, default = values.get("map.path"), values_of(MapSettings(), "map.")
+    aligned = values.get("map.path")
     if aligned and os.path.exists(aligned) and not os.path.samefile(aligned, options.map):
         raise ValueError(f"{options.align}: is of another map, {aligned}, not of {options.map}")
-    given = {name: value for name, value in values_of(map_settings(options), "map.").items() if value != default[name]}
-    return Settings.checked(values | given).map.resolved()
+    return Settings.checked(values | given_map(options)).map.resolved()
 
 
 def _plan(options: argparse.Namespace, given: MapSettings) -> tuple[Bundle, dict[str, Path]]:

@@ -16,19 +16,17 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from dataclasses import replace
 from pathlib import Path
 
 from tqdm import tqdm
 
-from gsfeatloc_ros.common.parameter import values_of
 from gsfeatloc_ros.common.threads import limit_threads
 from gsfeatloc_ros.common.words import in_one_line
 from gsfeatloc_ros.evaluate.extras import import_extra
 from gsfeatloc_ros.localize.engine import Engine, load_engine
 from gsfeatloc_ros.localize.map_index import index_for, index_key
 from gsfeatloc_ros.localize.options import LocalizerOptions
-from gsfeatloc_ros.localize.settings import MapSettings, MatcherSettings
+from gsfeatloc_ros.localize.settings import MatcherSettings
 from gsfeatloc_ros.match import MATCHERS
 from gsfeatloc_ros.replay.bag import Role, open_bag
 from gsfeatloc_ros.replay.bag_files import BagError
@@ -44,8 +42,8 @@ from gsfeatloc_ros.ros_io.settings import Settings
 from gsfeatloc_ros.tools.options import (
     CollectSettings,
     add_map_options,
+    given_map,
     localizer_options,
-    map_settings,
     node_parameter,
     number,
     print_reading,
@@ -124,10 +122,7 @@ def _settings(options: argparse.Namespace) -> Settings:
     """
     values = read_parameter_file(options.params_file) if options.params_file else {}
     values |= dict(options.parameter)
-    map_, default = (
-        values_of(map_, "map.") for map_ in (replace(map_settings(options), path=str(options.map or "")), MapSettings())
-    )
-    values |= {name: value for name, value in map_.items() if value != default[name]}
+    values |= given_map(options)
     own = {
         "prior_max_age": options.prior_max_age,
         "image.rectified": options.rectified or None,

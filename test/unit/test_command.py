@@ -22,6 +22,7 @@ NEED_ROS = {"demo", "soak"}
 # The command lines of each tool in which BAD is a file or a folder, and MAP a map.
 COMMAND_LINES = {
     "inspect": ["BAD", "MAP --photos BAD", "MAP --html BAD/page.html"],
+    "view": ["BAD", "MAP --answers BAD", "MAP --params-file BAD"],
     "render": [
         "BAD --pose 0 0 0 0 0 0 1 --fov 60 --size 64x48 --out OUT",
         "MAP --path BAD --fov 60 --size 64x48 --out OUT",

@@ -16,7 +16,7 @@ ROOT = Path(__file__).parents[2]
 # Each may import those before it. docs/architecture.md has the same list, from the top.
 ROOMS = [
     *("common", "maps", "render", "match", "pose", "index", "localize", "crosscheck", "ros_io"),
-    *("simulate", "evaluate", "inspect", "benchmark", "replay", "align", "node", "client", "tools"),
+    *("simulate", "evaluate", "inspect", "benchmark", "replay", "align", "view", "node", "client", "tools"),
 ]
 # Those that talk to ROS. Of tools/, two start a node.
 ROS_ROOMS = {"node", "client"}

@@ -1,0 +1,117 @@
+"""What a running localizer says, for the page of gsfeatloc view; and priors to it."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseArray, PoseStamped, PoseWithCovarianceStamped
+from rclpy.qos import QoSProfile
+from sensor_msgs.msg import Image
+
+from gsfeatloc_ros.client.client_node import ClientNode
+from gsfeatloc_ros.client.messages import pose_with_covariance, read_diagnostics
+from gsfeatloc_ros.node.qos import LATCHED, RELIABLE
+from gsfeatloc_ros.ros_io.decode import decode_covariance, decode_pose, nanoseconds
+from gsfeatloc_ros.ros_io.raw_image import decode_image
+from gsfeatloc_ros.view.attempts import Attempt
+from gsfeatloc_ros.view.jpeg import encoded
+from gsfeatloc_ros.view.store import Store
+
+
+class LiveNode(ClientNode):
+    """Listens to a localizer in a thread of its own, and fills a store.
+
+    Args:
+        localizer: name of its node, with its namespace if it has one.
+        frame: of the map: poses in another are left out.
+        store: to fill.
+        arguments: of ROS: --ros-args with remappings.
+    """
+
+    def __init__(self, localizer: str, frame: str, store: Store, arguments: Sequence[str] = ()) -> None:
+        namespace, _, name = localizer.strip("/").rpartition("/")
+        super().__init__("gsfeatloc_view", f"/{namespace}", arguments)
+        self._frame, self._store = frame, store
+        self._status = f"{localizer.strip('/')}: localization"
+        self._priors = {
+            topic: self.node.create_publisher(PoseWithCovarianceStamped, topic, RELIABLE)
+            for topic in ("initialpose", "prior_with_covariance")
+        }
+        self._listen(PoseWithCovarianceStamped, "pose", self._on_pose, LATCHED)
+        self._listen(DiagnosticArray, "/diagnostics", self._on_diagnostics)
+        self._listen(PoseArray, f"{name}/candidates", self._on_candidates)
+        self._listen(Image, "debug_image", self._on_debug_image)
+        self._listen(PoseStamped, "prior", self._on_prior)
+        self._listen(PoseWithCovarianceStamped, "prior_with_covariance", self._on_prior)
+        self._stopped = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="live", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Leave the graph."""
+        self._stopped.set()
+        self._thread.join()
+        super().close()
+
+    def send_base(self, pose: np.ndarray, covariance: np.ndarray) -> str:
+        """Send a pose (4, 4) of the base with its covariance (6, 6), as RViz does; return what was sent where."""
+        return self._send("initialpose", pose, covariance)
+
+    def send_camera(self, pose: np.ndarray, covariance: np.ndarray) -> str:
+        """Send a pose (4, 4) of the camera with its covariance (6, 6); return what was sent where."""
+        return self._send("prior_with_covariance", pose, covariance)
+
+    def _listen(self, kind: type, topic: str, callback: Callable[[Any], None], qos: QoSProfile = RELIABLE) -> None:
+        """Call back with what comes; what cannot be used is left out: the localizer says so itself."""
+
+        def take(message: Any) -> None:
+            with contextlib.suppress(ValueError):
+                callback(message)
+
+        self.node.create_subscription(kind, topic, take, qos)
+
+    def _send(self, topic: str, pose: np.ndarray, covariance: np.ndarray) -> str:
+        publisher = self._priors[topic]
+        message = pose_with_covariance(pose, covariance, self._frame)
+        message.header.stamp = self.node.get_clock().now().to_msg()
+        publisher.publish(message)
+        listeners = publisher.get_subscription_count()
+        # This node listens to one of the two itself.
+        others = listeners - (topic == "prior_with_covariance")
+        return f"sent on {publisher.topic_name}" + ("" if others > 0 else ", but nobody listens there")
+
+    # In the thread.
+
+    def _run(self) -> None:
+        self.spin_until(self._stopped.is_set, float("inf"))
+
+    def _on_pose(self, message: PoseWithCovarianceStamped) -> None:
+        if message.header.frame_id == self._frame:
+            stamp, pose = nanoseconds(message.header.stamp), decode_pose(message, "pose")
+            self._store.add(Attempt(stamp, "", "", pose, decode_covariance(message, "pose")))
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for diagnostic in read_diagnostics(message):
+            stamp = diagnostic.values.get("stamp", "")
+            if diagnostic.name == self._status and stamp:
+                seconds, _, rest = stamp.partition(".")
+                nanos = int(seconds) * 10**9 + int(rest.ljust(9, "0"))
+                self._store.add(Attempt(nanos, diagnostic.values["status"], diagnostic.reason))
+
+    def _on_candidates(self, message: PoseArray) -> None:
+        if message.header.frame_id == self._frame and message.poses:
+            header = message.header
+            poses = np.array([decode_pose(PoseStamped(header=header, pose=p), "candidate") for p in message.poses])
+            self._store.add(Attempt(nanoseconds(header.stamp), "", "", candidates=poses))
+
+    def _on_debug_image(self, message: Image) -> None:
+        self._store.add_picture(nanoseconds(message.header.stamp), encoded(decode_image(message)))
+
+    def _on_prior(self, message: PoseStamped | PoseWithCovarianceStamped) -> None:
+        if message.header.frame_id == self._frame:
+            self._store.add_prior(decode_pose(message, "prior"))

@@ -1,0 +1,55 @@
+"""Poses and covariances as shapes that can be drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from gsfeatloc_ros.common.geometry import transform
+
+# A camera's corners, left to right and top to bottom, and a mark above its image, one unit ahead (x right, y down).
+_CORNERS = np.array([[-0.6, -0.45, 1.0], [0.6, -0.45, 1.0], [0.6, 0.45, 1.0], [-0.6, 0.45, 1.0]])
+_TOP = np.array([[-0.3, -0.5, 1.0], [0.0, -0.75, 1.0], [0.3, -0.5, 1.0]])
+_EDGES = np.array(
+    [
+        *[(np.zeros(3), corner) for corner in _CORNERS],
+        *zip(_CORNERS, np.roll(_CORNERS, -1, axis=0), strict=True),
+        *zip(_TOP, np.roll(_TOP, -1, axis=0), strict=True),
+    ]
+)
+# Lines of a camera.
+EDGES = len(_EDGES)
+
+
+def frustums(poses: Sequence[np.ndarray], size: float) -> np.ndarray:
+    """Return cameras at poses (4, 4), T_map_camera, as lines (N * EDGES, 2, 3), `size` from the centre to the image."""
+    ends = size * _EDGES.reshape(-1, 3)
+    return np.array([transform(pose, ends) for pose in poses]).reshape(-1, 2, 3)
+
+
+def ellipsoids(covariances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the ellipsoids of one standard deviation of positions.
+
+    Args:
+        covariances: (N, 3, 3), symmetric; what rounding makes negative counts as 0.
+
+    Returns:
+        Rotation matrices (N, 3, 3), whose columns are the axes, and half their lengths (N, 3).
+    """
+    squares, axes = np.linalg.eigh(covariances.reshape(-1, 3, 3))
+    # Axes of a right hand.
+    axes[..., 0] *= np.sign(np.linalg.det(axes))[:, None]
+    return axes, np.sqrt(np.maximum(squares, 0.0))
+
+
+def looking_along(origin: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """Return the pose (4, 4) of a camera at a point (3,) that looks along a direction (3,) of any length."""
+    ahead = direction / np.linalg.norm(direction)
+    # Any axis that is not along it.
+    right = np.cross(np.eye(3)[np.argmin(np.abs(ahead))], ahead)
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.column_stack([right, np.cross(ahead, right), ahead])
+    pose[:3, 3] = origin
+    return pose

@@ -1,0 +1,100 @@
+"""What gsfeatloc view shows of a running node, and the priors that it sends."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+
+from gsfeatloc_ros.client.client_node import ClientNode
+from gsfeatloc_ros.client.messages import pose_stamped, pose_with_covariance, rgb_image
+from gsfeatloc_ros.common.geometry import make_pose
+from gsfeatloc_ros.view.store import Store
+
+POSE = make_pose(np.eye(3), [1.0, 2.0, 3.0])
+STAMP = 5_000_000_007
+
+
+def wait_for(condition):
+    deadline = time.monotonic() + 30
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+@pytest.fixture
+def live():
+    """A listener to /robot/localizer and its store."""
+    from gsfeatloc_ros.client.live import LiveNode
+
+    store = Store()
+    node = LiveNode("/robot/localizer", "map", store, ["--ros-args", "-r", "pose:=answers"])
+    yield node, store
+    node.close()
+
+
+@pytest.fixture
+def robot():
+    node = ClientNode("robot")
+    yield node
+    node.close()
+
+
+def publisher(robot, kind, topic):
+    from gsfeatloc_ros.node.qos import LATCHED
+
+    made = robot.node.create_publisher(kind, topic, LATCHED)
+    wait_for(made.get_subscription_count)
+    return made
+
+
+def test_an_attempt_is_put_together_of_all_that_a_node_says_of_it(live, robot):
+    from builtin_interfaces.msg import Time
+    from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+    from geometry_msgs.msg import PoseArray, PoseStamped, PoseWithCovarianceStamped
+    from sensor_msgs.msg import Image
+
+    _, store = live
+    stamp = Time(sec=5, nanosec=7)
+    publisher(robot, PoseStamped, "/robot/prior").publish(pose_stamped(POSE))
+    wait_for(lambda: store.newest_prior is not None)
+    answer, elsewhere = pose_with_covariance(POSE, np.eye(6)), pose_with_covariance(POSE, frame_id="odom")
+    answer.header.stamp = stamp
+    poses = publisher(robot, PoseWithCovarianceStamped, "/robot/answers")
+    poses.publish(elsewhere)
+    poses.publish(answer)
+    candidates = PoseArray(header=answer.header, poses=[answer.pose.pose] * 2)
+    publisher(robot, PoseArray, "/robot/localizer/candidates").publish(candidates)
+    picture = rgb_image(np.full((4, 6, 3), 90, np.uint8))
+    picture.header.stamp = stamp
+    publisher(robot, Image, "/robot/debug_image").publish(picture)
+    values = [KeyValue(key="status", value="ambiguous"), KeyValue(key="stamp", value="5.000000007")]
+    said = DiagnosticStatus(name="robot/localizer: localization", message="two places", values=values)
+    other = DiagnosticStatus(name="other/localizer: localization", message="no", values=values)
+    publisher(robot, DiagnosticArray, "/diagnostics").publish(DiagnosticArray(status=[other, said]))
+    wait_for(lambda: store.attempts() and store.attempts()[0].status)
+    wait_for(lambda: store.attempts()[0].candidates is not None and store.picture(STAMP) is not None)
+    (attempt,) = store.attempts()
+    assert (attempt.stamp, attempt.status, attempt.reason) == (STAMP, "ambiguous", "two places")
+    np.testing.assert_allclose(attempt.pose, POSE)
+    np.testing.assert_allclose(attempt.covariance, np.eye(6))
+    assert attempt.candidates.shape == (2, 4, 4)
+    np.testing.assert_allclose(store.prior(STAMP), POSE)
+
+
+def test_priors_are_sent_as_rviz_does_and_of_the_camera(live, robot):
+    from geometry_msgs.msg import PoseWithCovarianceStamped
+
+    node, _ = live
+    assert "nobody listens" in node.send_base(POSE, np.eye(6))
+    got = []
+    for topic in ("initialpose", "prior_with_covariance"):
+        robot.node.create_subscription(PoseWithCovarianceStamped, f"/robot/{topic}", got.append, 10)
+    wait_for(
+        lambda: "nobody" not in node.send_base(POSE, np.eye(6)) and "nobody" not in node.send_camera(POSE, np.eye(6))
+    )
+    assert robot.spin_until(lambda: len(got) >= 2, 30)
+    assert got[0].header.frame_id == "map"
+    assert got[0].pose.pose.position.y == 2.0
+    assert got[0].pose.covariance[0] == 1.0

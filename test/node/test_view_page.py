@@ -1,0 +1,86 @@
+"""The page of the installed gsfeatloc view, in a real browser."""
+
+from __future__ import annotations
+
+import re
+import signal
+import subprocess
+import sys
+
+import browser as chromium
+import numpy as np
+import pytest
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import connect
+
+from gsfeatloc_ros.maps.ply import write_ply
+from gsfeatloc_ros.ros_io.parameter_file import read_parameter_file
+
+NAMES = "stamp,status,reason,x,y,z,qx,qy,qz,qw,var_x,var_y,var_z,var_rx,var_ry,var_rz"
+# The camera stands in the middle of the room and looks along x.
+ANSWER = "1.5,localized,well done,0,0,1.5,-0.5,0.5,-0.5,0.5,1e-4,1e-4,1e-4,1e-6,1e-6,1e-6"
+FAILURE = "2.5,failed,<b>dark</b>,,,,,,,,,,,,,"
+
+
+@pytest.fixture(scope="module")
+def page(room_map, tmp_path_factory):
+    """The address of the page, and the parameter file that it may write."""
+    folder = tmp_path_factory.mktemp("view")
+    write_ply(folder / "room.ply", room_map)
+    (folder / "replayed").mkdir()
+    (folder / "replayed" / "answers.csv").write_text("\n".join([NAMES, ANSWER, FAILURE]))
+    command = [sys.executable, "-P", "-m", "gsfeatloc_ros.tools.view", folder / "room.ply", "--port", "0"]
+    command += ["--answers", folder / "replayed", "--out", folder / "map.yaml", "--gaussians", "5000"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    try:
+        address = process.stdout.readline().strip()
+        assert re.fullmatch(r"http://127\.0\.0\.1:\d+", address)
+        yield address, folder / "map.yaml"
+        process.send_signal(signal.SIGINT)
+        assert process.wait(30) == 130
+    finally:
+        process.kill()
+        process.wait()
+
+
+@pytest.mark.skipif(not chromium.EXECUTABLE, reason=f"there is no {' or '.join(chromium.NAMES)}")
+def test_a_user_sees_the_map_stands_at_an_answer_and_sets_the_floor(page, tmp_path):
+    address, parameters = page
+    with chromium.browser(address, tmp_path / "profile") as user:
+        user.wait_for_text("room.ply")
+
+        def spread():
+            # Left of the panel.
+            return user.screenshot()[100:, :350].std()
+
+        # The map is no white page.
+        chromium.wait_for(lambda: spread() > 15, "the map")
+        user.press("Answers")
+        user.wait_for_text("2 images: 1 failed, 1 localized")
+        user.press("1: 1.50 s, localized")
+        user.wait_for_text("well done")
+        user.wait_for("document.querySelectorAll('img').length > 0")
+        user.press("2: 2.50 s, failed")
+        # As it is, and no HTML.
+        user.wait_for_text("<b>dark</b>")
+        user.press("Frame")
+        user.press("Floor: find it in the map")
+        user.wait_for_text("off that")
+        user.press("Write map.yaml")
+        user.wait_for_text("wrote ")
+    values = read_parameter_file(parameters)
+    np.testing.assert_allclose(values["map.translation"], [0, 0, 0], atol=0.05)
+
+
+def test_a_page_from_elsewhere_is_not_served(page):
+    import viser
+
+    address = page[0].replace("http", "ws")
+    protocol = [f"viser-v{viser.__version__}"]
+    with connect(address, subprotocols=protocol, origin=page[0]) as own:
+        assert own.recv(30)
+    with (
+        pytest.raises((ConnectionClosed, InvalidStatus)),
+        connect(address, subprotocols=protocol, origin="https://evil.example") as foreign,
+    ):
+        foreign.recv(30)
