@@ -3,6 +3,7 @@
 manifest.json                   format, version, what made it, parameters map.*, size and SHA-256 of each file
 map/NAME                        the map's file, or its files; beside it the prepared map and the index of views
 alignment.yaml                  what `gsfeatloc align` wrote, if there was an alignment
+inspection.json, .html          what `gsfeatloc inspect` says of the map
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from gsfeatloc_ros.maps.gaussian_map import MapError
 
 MANIFEST, ALIGNMENT = "manifest.json", "alignment.yaml"
 MAP_FOLDER = "map"
+INSPECTION = ("inspection.json", "inspection.html")
 
 _FORMAT, _VERSION = "gsfeatloc_ros map bundle", 1
 _SHA256 = re.compile(r"[0-9a-f]{64}")

@@ -5,18 +5,20 @@
     scp -r room robot:
 
 The folder holds a copy of the map, where it lies in the robot's frame, the map prepared for rendering, the index of its
-views, and a manifest with sizes and checksums. What of it is there already and fits is not made again: after an
-interruption, the same command goes on.
+views, what gsfeatloc inspect says of it, and a manifest with sizes and checksums. What of it is there already and fits
+is not made again: after an interruption, the same command goes on.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import sys
 import time
 from dataclasses import replace
 from importlib.metadata import PackageNotFoundError, version
+from importlib.util import find_spec
 from pathlib import Path
 
 from tqdm import tqdm
@@ -25,11 +27,13 @@ from gsfeatloc_ros.common.kernel_cache import can_write
 from gsfeatloc_ros.common.replaced_file import replaced_file
 from gsfeatloc_ros.common.safe_files import open_regular
 from gsfeatloc_ros.index.storage import index_path
+from gsfeatloc_ros.inspect.inspection import inspect_map
+from gsfeatloc_ros.inspect.page import as_page
 from gsfeatloc_ros.localize.engine import load_renderer
 from gsfeatloc_ros.localize.map_index import index_key, load_or_make
 from gsfeatloc_ros.localize.settings import MapSettings, RendererSettings
 from gsfeatloc_ros.maps import MapError, load_map
-from gsfeatloc_ros.maps.bundle import ALIGNMENT, MAP_FOLDER, Bundle, map_in, read_bundle
+from gsfeatloc_ros.maps.bundle import ALIGNMENT, INSPECTION, MAP_FOLDER, Bundle, map_in, read_bundle
 from gsfeatloc_ros.maps.files import content_of, find_map, map_files
 from gsfeatloc_ros.render.cache import SUFFIX
 from gsfeatloc_ros.ros_io.parameter_file import read_parameter_file
@@ -54,7 +58,8 @@ def _prepare(options: argparse.Namespace) -> int:
     start = time.perf_counter()
     given = _given(options)
     poses = training_poses(options, given.alignment())
-    if read_bundle(options.out) is None:
+    old = read_bundle(options.out)
+    if old is None:
         load_map(given.path, options=given.reading)  # what is no map is not copied
     bundle, sources = _plan(options, given)
     _copy(bundle, sources)
@@ -64,6 +69,8 @@ def _prepare(options: argparse.Namespace) -> int:
     index_file, key = index_path(map_.path), index_key(map_.path, map_, matcher_settings(options))
     index = load_or_make(index_file, key, lambda: make_index(options, renderer, poses))
     derived = [bundle.map.with_name(bundle.map.name + SUFFIX), index_file]
+    if not options.skip_inspection:
+        derived += _inspected(bundle, old, RendererSettings(options.device, options.threads))
     contents = {file.relative_to(bundle.folder).as_posix(): content_of(file) for file in derived}
     bundle = replace(bundle, derived=contents, made_by={**bundle.made_by, "views": len(index)})
     bundle.write()
@@ -139,6 +146,38 @@ def _copy(bundle: Bundle, sources: dict[str, Path]) -> None:
                     bar.update(len(data))
 
 
+def _inspected(bundle: Bundle, old: Bundle | None, renderer: RendererSettings) -> list[Path]:
+    """Inspect the map where it lies, unless that was done; return the files that say what was found.
+
+    Args:
+        bundle: whose map it is.
+        old: what the manifest said before; None for none.
+        renderer: how the map is drawn.
+    """
+    files = [bundle.folder / name for name in INSPECTION if not name.endswith(".html") or find_spec("jinja2")]
+    # As a manifest says them: what was a tuple is a list there.
+    now = read_bundle(bundle.folder)
+    if old is not None and now is not None and old.parameters == now.parameters:
+        made = replace(old, files=old.derived)
+        if all(file.name in made.files and _lies_there(made, file.name) for file in files):
+            return files
+    map_ = replace(MapSettings(str(bundle.folder)).resolved(), path=str(bundle.map))
+    with tqdm(desc="inspect", unit="view", disable=None) as bar:
+
+        def progress(done: int, total: int) -> None:
+            bar.total = total
+            bar.update(done - bar.n)
+
+        inspection = inspect_map(map_, renderer, progress=progress)
+    contents = {".json": json.dumps(inspection.as_json(), indent=1, allow_nan=False) + "\n"}
+    if len(files) > 1:
+        contents[".html"] = as_page(inspection, f"gsfeatloc inspect {bundle.map.name}")
+    for file in files:
+        with replaced_file(file) as stream:
+            stream.write(contents[file.suffix].encode())
+    return files
+
+
 def _lies_there(bundle: Bundle, name: str) -> bool:
     path, content = bundle.folder / name, bundle.files[name]
     return path.is_file() and path.stat().st_size == content[0] and content_of(path) == content
@@ -158,6 +197,7 @@ def make_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("map", type=Path, metavar="MAP", help="the Gaussian Splatting map")
     parser.add_argument("--out", type=Path, required=True, metavar="BUNDLE", help="the folder, which is made")
+    parser.add_argument("--skip-inspection", action="store_true", help="do not look at what is in the map")
     parser.add_argument("--align", type=Path, metavar="FILE", help="where the map lies, as gsfeatloc align wrote it")
     add_index_options(parser)
     add_map_options(parser)

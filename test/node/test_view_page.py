@@ -30,7 +30,7 @@ def page(room_map, tmp_path_factory):
     (folder / "replayed").mkdir()
     (folder / "replayed" / "answers.csv").write_text("\n".join([NAMES, ANSWER, FAILURE]))
     command = [sys.executable, "-P", "-m", "gsfeatloc_ros.tools.view", folder / "room.ply", "--port", "0"]
-    command += ["--answers", folder / "replayed", "--out", folder / "map.yaml", "--gaussians", "5000"]
+    command += ["--answers", folder / "replayed", "--out", folder / "map.yaml", "--gaussians", "2000"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     try:
         address = process.stdout.readline().strip()
@@ -51,7 +51,7 @@ def test_a_user_sees_the_map_stands_at_an_answer_and_sets_the_floor(page, tmp_pa
 
         def spread():
             # Left of the panel.
-            return user.screenshot()[100:, :350].std()
+            return user.screenshot()[100:, :250].std()
 
         # The map is no white page.
         chromium.wait_for(lambda: spread() > 15, "the map")

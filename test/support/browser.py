@@ -22,8 +22,9 @@ EXECUTABLE = next(filter(None, map(shutil.which, NAMES)), None)
 _OPTIONS = (
     *("--headless", "--no-sandbox", "--no-first-run", "--disable-quic", "--remote-debugging-port=0"),
     *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
-    # WebGL without a GPU.
+    # WebGL without a GPU, however slow.
     *("--disable-gpu", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
+    "--disable-gpu-watchdog",
 )
 # Seconds. Pictures of splats that a CPU draws take long.
 TIMEOUT = 120.0
@@ -59,9 +60,14 @@ class Browser:
         return wait_for(lambda: self.run(script), script)
 
     def press(self, text: str) -> None:
-        """Click the button or tab that has a text."""
-        buttons = "[...document.querySelectorAll('button,[role=tab]')]"
-        self.wait_for(f"(b => b && (b.click(), true))({buttons}.find(b => b.textContent.includes({json.dumps(text)})))")
+        """Click the button or tab that has a text, with the mouse: some do not hear of other clicks."""
+        button = (
+            f"[...document.querySelectorAll('button,[role=tab]')].find(b => b.textContent.includes({json.dumps(text)}))"
+        )
+        middle = "(b.scrollIntoView(), (r => [r.x + r.width / 2, r.y + r.height / 2])(b.getBoundingClientRect()))"
+        x, y = self.wait_for(f"(b => b && {middle})({button})")
+        for kind in ("mouseMoved", "mousePressed", "mouseReleased"):
+            self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
 
     def wait_for_text(self, text: str) -> None:
         """Wait until the page has a text."""
@@ -74,7 +80,7 @@ class Browser:
 
 
 @contextmanager
-def browser(url: str, folder: Path, size: tuple[int, int] = (800, 500)) -> Iterator[Browser]:
+def browser(url: str, folder: Path, size: tuple[int, int] = (700, 450)) -> Iterator[Browser]:
     """Open a page, with a new profile in a folder."""
     process = subprocess.Popen(
         [EXECUTABLE, *_OPTIONS, f"--user-data-dir={folder}", "about:blank"], stderr=subprocess.DEVNULL

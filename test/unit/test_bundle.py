@@ -19,7 +19,7 @@ from gsfeatloc_ros.render.cache import load_prepared, map_content
 from gsfeatloc_ros.tools import prepare
 
 PLACED = MapSettings(aligned=True, scale=2.0, translation=(1.0, 2.0, 3.0), rotation=(0.0, 0.0, 0.6, 0.8))
-FEW = ["--views", "3"]
+FEW = ["--views", "3", "--skip-inspection"]
 
 
 @pytest.fixture(scope="module")
@@ -75,6 +75,23 @@ def test_what_is_there_and_fits_is_not_made_again(bundle, room_map_file, tmp_pat
     read_bundle(bundle).map.unlink()
     assert prepare.main(again) == 0
     read_bundle(bundle).check_map()
+
+
+@pytest.mark.slow
+def test_a_bundle_says_what_is_in_its_map(bundle, room_map_file, tmp_path) -> None:
+    write_parameters(tmp_path / "align.yaml", PLACED, [])
+    again = [str(room_map_file), "--align", str(tmp_path / "align.yaml"), "--out", str(bundle), "--views", "3"]
+    assert prepare.main(again) == 0
+    found = json.loads((bundle / "inspection.json").read_text())
+    # Where the map lies in the bundle: turned about z, twice as large, and 3 higher.
+    assert found["upright"]["sure"]
+    assert found["upright"]["up"][2] == pytest.approx(1, abs=1e-3)
+    assert found["upright"]["floor"] == pytest.approx(3, abs=0.1)
+    assert "<html" in (bundle / "inspection.html").read_text()
+    assert {"inspection.json", "inspection.html"} <= set(read_bundle(bundle).derived)
+    before = (bundle / "inspection.json").stat().st_mtime_ns
+    assert prepare.main(again) == 0
+    assert (bundle / "inspection.json").stat().st_mtime_ns == before
 
 
 @pytest.mark.parametrize(
