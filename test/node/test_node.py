@@ -187,7 +187,7 @@ def test_service_tells_of_failure(client, room_camera, photo):
     assert not client.attempt(image).ok
     answer = client.relocalize()
     assert not answer.success
-    assert "features" in answer.message
+    assert "corners" in answer.message
     assert client.pose_of(image) is None
 
 

@@ -146,7 +146,7 @@ def test_query_is_split_into_stages(scene, tmp_path, capsys):
     report = measured(tmp_path, "query", "--scene", scene, "--matcher", "sift", "--sigma", "0.3")
     assert (report["photos"], report["localized"], report["matcher"]) == (2, 2, "sift")
     stages = report["stages_cpu_ms"]
-    assert {"prepare", "features", "render", "match", "track", "solve", "verify"} <= stages.keys()
+    assert {"prepare", "render", "track", "solve", "verify"} <= stages.keys()
     # Medians of the parts need not add up to that of the whole.
     assert sum(stages.values()) == pytest.approx(report["cpu_ms"]["median"], rel=0.3)
     assert "2 of 2 photos localized" in capsys.readouterr().out
