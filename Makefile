@@ -29,11 +29,12 @@ docs: setup
 	@. scripts/env.sh && NO_MKDOCS_2_WARNING=1 python -m mkdocs build && echo "docs: site/index.html; with its search: python3 -m http.server --directory site"
 
 # -P: what is tested is what is installed, not the sources here. Tests of the node mostly wait: apart from those that
-# compute, which would let them wait too long; and those that say in how many seconds it ends, alone.
+# compute, which would let them wait too long; and those that say in how many seconds it ends, alone. Who has no more to
+# compute takes what others have left; a node serves all tests of its file.
 test: lint build
 	@. scripts/env.sh && tests="python -P -m pytest" && \
-	$$tests -n 2 --dist loadfile test/unit test/gpu test/real && \
-	$$tests -n 2 --dist loadfile test/node --ignore test/node/test_node_stop.py && \
+	$$tests -n 2 --dist worksteal test/unit test/gpu test/real && \
+	$$tests -n 3 --dist loadfile test/node --ignore test/node/test_node_stop.py && \
 	$$tests test/node/test_node_stop.py
 
 # The option named last counts: the one of pyproject.toml comes before it.

@@ -173,9 +173,11 @@ def _paint_face(rng: np.random.Generator, solid: Solid, face: int) -> np.ndarray
     """Paint the picture of a face: rows run along v, columns along u."""
     cols, rows = np.maximum(np.rint(solid.face_size(face) / TEXEL), 1).astype(int)
     picture = paint(rng, rows, cols, TEXEL)
-    _, normals = solid.face_points(face, grid_uv(rows, cols))
+    # A flat face is of one shade.
+    grid = (1, 1) if isinstance(solid, Box) else (rows, cols)
+    _, normals = solid.face_points(face, grid_uv(*grid))
     shade = 0.8 + 0.2 * (normals @ _LIGHT)
-    return (picture * shade.reshape(rows, cols, 1)).astype(np.uint8)
+    return (picture * shade.reshape(*grid, 1)).astype(np.uint8)
 
 
 def grid_uv(rows: int, cols: int) -> np.ndarray:

@@ -137,7 +137,7 @@ def test_a_flat_transform_that_ends_when_the_robot_is_lost(tf, room_map_file, ro
 
 
 def test_of_a_planar_robot_only_x_y_and_yaw_are_unknown(tf, room_map_file, room_camera, photo, T_map_base):
-    parameters = {"map__path": room_map_file, "map__aligned": True, "search__planar": True}
+    parameters = {"map__path": room_map_file, "index__build": True, "map__aligned": True, "search__planar": True}
     with running_localizer(**parameters) as process, connected_client() as client:
         process.wait_for_index()
         static = tell_where_the_camera_is(client, invert(T_map_base) @ photo.T_map_camera)

@@ -97,10 +97,7 @@ def assert_clean_end(process: NodeProcess, number: signal.Signals, timeout: floa
         ({"map__path": "/nowhere/room.ply"}, "/nowhere/room.ply"),
         ({"map__path": executable()}, "localizer"),
         ({"matcher__name": "orb", "map__path": "ROOM"}, "'orb' is not one of"),
-        ({"renderer__device": "abacus", "map__path": "ROOM"}, "'abacus' is not one of"),
         ({"renderer__sh_degree": 4, "map__path": "ROOM"}, "renderer.sh_degree"),
-        ({"renderer__resolution_scale": 1.5, "map__path": "ROOM"}, "renderer.resolution_scale"),
-        ({"localizer__max_passes": 0, "map__path": "ROOM"}, "localizer.max_passes"),
     ],
 )
 def test_start_that_cannot_be_says_why_in_one_line(room_map_file, parameters, says):

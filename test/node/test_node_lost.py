@@ -72,7 +72,7 @@ class Robot:
 @pytest.fixture(scope="module")
 def localizer(room_map_file):
     """One that goes on from its answers, whose view index is built."""
-    with running_localizer(map__path=room_map_file, track=True) as process:
+    with running_localizer(map__path=room_map_file, index__build=True, track=True) as process:
         process.wait_for_index()
         yield process
 

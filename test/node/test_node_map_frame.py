@@ -55,11 +55,6 @@ def test_answers_are_in_the_frame_of_the_robot(room_map_file, room_camera, room_
     ("name", "value", "says"),
     [
         ("map__scale", "0.0", "map.scale"),
-        ("map__scale", "-1.0", "map.scale"),
-        ("map__translation", "[1.0, 2.0]", "parameter map.translation: [1.0, 2.0] is not 3 finite numbers"),
-        ("map__translation", "[1.0, 2.0, .nan]", "parameter map.translation: [1.0, 2.0, nan] is not 3 finite numbers"),
-        ("map__rotation", "[0.0, 0.0, 1.0]", "parameter map.rotation: [0.0, 0.0, 1.0] is not 4 finite numbers"),
-        ("map__rotation", "[0.0, 0.0, 0.0, 0.0]", "parameter map.rotation: quaternion [0.0, 0.0, 0.0, 0.0] has no"),
         ("map__rotation", "[0.0, .inf, 0.0, 1.0]", "parameter map.rotation: [0.0, inf, 0.0, 1.0] is not 4 finite"),
         ("map__dataparser_transforms", "/nowhere/transforms.json", "/nowhere/transforms.json: cannot be read"),
     ],

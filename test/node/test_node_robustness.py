@@ -29,7 +29,7 @@ END_TIMEOUT = 8.0
 
 @pytest.fixture(scope="module")
 def localizer(room_map_file):
-    with running_localizer(map__path=room_map_file, matcher__name="sift", image__timeout=1.0) as process:
+    with running_localizer(map__path=room_map_file, index__build=True, image__timeout=1.0) as process:
         process.wait_for_index()
         yield process
 

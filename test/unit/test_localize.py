@@ -30,6 +30,12 @@ def localizer(renderer, request):
     return Localizer(renderer, create_matcher(request.param))
 
 
+# The search is the same for all matchers.
+sift_and_in_the_night_xfeat = pytest.mark.parametrize(
+    "localizer", ["sift", pytest.param("xfeat", marks=pytest.mark.nightly)], indirect=True
+)
+
+
 @pytest.fixture(scope="module")
 def sift_localizer(renderer):
     return Localizer(renderer, create_matcher("sift"))
@@ -154,12 +160,14 @@ def test_a_prior_that_sees_nothing_is_a_failure(localizer, room_camera, room_pho
 
 
 @pytest.mark.slow
+@sift_and_in_the_night_xfeat
 def test_noise_is_no_place(localizer, room_camera, room_photos) -> None:
     noise = np.random.default_rng(0).integers(0, 256, room_photos[0].image.shape, dtype=np.uint8)
     assert_no_answer(localizer.localize(noise, room_camera, room_photos[0].T_map_camera))
 
 
 @pytest.mark.slow
+@sift_and_in_the_night_xfeat
 def test_mirrored_photos_are_rejected(localizer, room_camera, room_photos) -> None:
     """Seen from behind, through the wall, the room is mirrored: poses there match well, but are far from the prior."""
     for photo in room_photos[:2]:

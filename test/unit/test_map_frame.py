@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -27,6 +28,7 @@ from gsfeatloc_ros.maps import GaussianMap, MapError, Similarity, load_map, read
 from gsfeatloc_ros.match import create_matcher
 from gsfeatloc_ros.render import create_renderer
 from gsfeatloc_ros.render.reference import ReferenceRenderer
+from gsfeatloc_ros.ros_io.settings import Settings
 
 CAMERA = Camera(75, 53, np.array([[70.0, 0, 34], [0, 66.0, 27], [0, 0, 1]]))
 
@@ -113,6 +115,22 @@ def test_what_is_no_similarity_is_refused(scale, rotation, translation, match):
         Similarity(scale, rotation, translation)
 
 
+@pytest.mark.parametrize(
+    ("name", "value", "says"),
+    [
+        ("map.scale", 0.0, "map.scale"),
+        ("map.scale", -1.0, "map.scale"),
+        ("map.translation", [1.0, 2.0], "parameter map.translation: [1.0, 2.0] is not 3 finite numbers"),
+        ("map.translation", [1.0, 2.0, np.nan], "parameter map.translation: [1.0, 2.0, nan] is not 3 finite numbers"),
+        ("map.rotation", [0.0, 0.0, 1.0], "parameter map.rotation: [0.0, 0.0, 1.0] is not 4 finite numbers"),
+        ("map.rotation", [0.0, 0.0, 0.0, 0.0], "parameter map.rotation: quaternion [0.0, 0.0, 0.0, 0.0] has no"),
+    ],
+)
+def test_parameters_of_a_frame_that_is_none_are_refused(name, value, says):
+    with pytest.raises(ValueError, match=re.escape(says)):
+        Settings.checked({"map.path": "room.ply", name: value}).map.alignment()
+
+
 # Rendering
 
 
@@ -143,7 +161,7 @@ def test_the_robots_own_frame_changes_nothing():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.nightly)])
 def test_answers_are_in_the_robots_frame(room_map, room_camera, room_photos, seed):
     S_map_splat = random_similarity(seed)
     here = Localizer(create_renderer(room_map), create_matcher("sift"))
