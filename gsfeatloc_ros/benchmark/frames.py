@@ -19,7 +19,7 @@ from gsfeatloc_ros.localize.settings import RendererSettings
 from gsfeatloc_ros.maps import GaussianMap, load_map
 from gsfeatloc_ros.render import DrawOptions, Render, SplatRenderer, create_renderer
 from gsfeatloc_ros.render.cache import load_prepared
-from gsfeatloc_ros.render.prepare import PreparedMap
+from gsfeatloc_ros.render.chunks import PreparedMap
 
 Size = tuple[int, int]
 

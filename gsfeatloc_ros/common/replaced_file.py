@@ -19,7 +19,7 @@ _SUFFIX = ".tmp"
 
 @contextmanager
 def replaced_file(path: Path) -> Iterator[BinaryIO]:
-    """Open what is to take the place of a file, or to be it.
+    """Open, to be written and read, what is to take the place of a file, or to be it.
 
     Whoever reads `path` finds the old file or the whole new one, after a power cut as well. It is put in place at the
     end of the block, and not at all if that is left by an exception. Others can read it, not write to it.
@@ -33,9 +33,9 @@ def replaced_file(path: Path) -> Iterator[BinaryIO]:
     _remove_leftovers(path)
     # Beside it: a file is only renamed within a file system. Nobody can have put a link there under a name of chance.
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}{_SUFFIX}")
-    descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+    descriptor = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
     try:
-        with os.fdopen(descriptor, "wb") as stream:
+        with os.fdopen(descriptor, "w+b") as stream:
             fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
             yield stream
             stream.flush()

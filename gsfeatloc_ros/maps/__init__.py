@@ -4,9 +4,14 @@ from __future__ import annotations
 
 import json
 import zlib
+from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
-from gsfeatloc_ros.maps.assemble import read_packed
+import numpy as np
+
+from gsfeatloc_ros.maps.assemble import Block, Gather, Layout, T, read_packed
+from gsfeatloc_ros.maps.assemble import assemble as to_gaussian_map
 from gsfeatloc_ros.maps.bundle import read_bundle
 from gsfeatloc_ros.maps.files import find_map
 from gsfeatloc_ros.maps.foreign import (
@@ -65,25 +70,45 @@ def load_map(
     if bundle is not None:
         bundle.check_map()
     path = Path(path) if bundle is None else bundle.map
+    gaussian_map = gather_map(path, options, to_gaussian_map)
+    check_seen(path, gaussian_map.opacities)
+    return gaussian_map if alignment is None else gaussian_map.placed(alignment)
+
+
+def gather_map(path: Path, options: ReadOptions, gather: Gather[T]) -> T:
+    """Read a map that is no bundle, and return what `gather` makes of its blocks.
+
+    Raises:
+        MapError: the file cannot be used.
+    """
     try:
         found = find_map(path)
-        gaussian_map = _read(found, options)
+        said = f"of the folder, {found.relative_to(path)} is read" if path.is_dir() else ""
+
+        def gather_noted(path: Path, layout: Layout, blocks: Iterable[Block], options: ReadOptions) -> T:
+            notes = (said, *layout.notes) if said else layout.notes
+            return gather(path, replace(layout, notes=notes), blocks, options)
+
+        # What does not fit into float32 becomes infinite and is left out by its value.
+        with np.errstate(over="ignore", invalid="ignore"):
+            return _read(found, options, gather_noted)
     except OSError as error:
         raise MapError(f"{path}: cannot be read: {error.strerror or error}") from error
     except MemoryError as error:
         raise MapError(f"{path}: does not fit into this machine's memory: crop or thin the map") from error
-    most = float(gaussian_map.opacities.max(initial=0.0))
+
+
+def check_seen(path: Path, opacities: np.ndarray) -> None:
+    """Raise MapError where none of the Gaussians of a map can be seen, by their opacities (N,)."""
+    most = float(opacities.max(initial=0.0))
     if most < _MIN_OPACITY:
         raise MapError(
-            f"{path}: nothing in it can be seen: none of its {len(gaussian_map.opacities)} Gaussians has an opacity of "
-            f"more than {most:.2g}; was its training, or its export, broken off?"
+            f"{path}: nothing in it can be seen: none of its {len(opacities)} Gaussians has an opacity of more than "
+            f"{most:.2g}; was its training, or its export, broken off?"
         )
-    if path.is_dir():
-        gaussian_map = gaussian_map.with_note(f"of the folder, {found.relative_to(path)} is read")
-    return gaussian_map if alignment is None else gaussian_map.placed(alignment)
 
 
-def _read(path: Path, options: ReadOptions) -> GaussianMap:
+def _read(path: Path, options: ReadOptions, gather: Gather[T]) -> T:
     if path.is_dir():
         refuse_foreign_folder(path)
     if path.exists() and not path.is_file():  # opening a pipe would wait for its writer
@@ -94,45 +119,45 @@ def _read(path: Path, options: ReadOptions) -> GaussianMap:
         raise MapError(f"{path}: is an empty file")
     # A .splat begins with its first Gaussian, which may be any bytes, { for example.
     if head.startswith(b"ply"):
-        return read_ply(path, options)
+        return read_ply(path, options, gather)
     if head.startswith(b"NGSP"):
-        return read_spz(path, options)
+        return read_spz(path, options, gather)
     if head.startswith(b"\x1f\x8b\x08"):
-        return _read_gzip(path, head, options)
+        return _read_gzip(path, head, options, gather)
     if head.startswith((b"PK\x03\x04", b"PK\x05\x06")):  # the latter is an empty zip
-        return _read_zip(path, options)
+        return _read_zip(path, options, gather)
     if head.startswith(b"{") and head.isascii() and b"\0" not in head:
-        return _read_json(path, options)
+        return _read_json(path, options, gather)
     refuse_foreign(path, head)
-    return read_splat(path, options)
+    return read_splat(path, options, gather)
 
 
-def _read_gzip(path: Path, head: bytes, options: ReadOptions) -> GaussianMap:
+def _read_gzip(path: Path, head: bytes, options: ReadOptions, gather: Gather[T]) -> T:
     try:
         beginning = zlib.decompressobj(16 + zlib.MAX_WBITS).decompress(head, 16)
     except zlib.error as error:
         raise MapError(f"{path}: is a damaged gzip: {error}") from error
     if beginning and not b"NGSP".startswith(beginning[:4]):
         refuse_foreign_gzip(path, beginning)
-    return read_spz(path, options)
+    return read_spz(path, options, gather)
 
 
-def _read_zip(path: Path, options: ReadOptions) -> GaussianMap:
+def _read_zip(path: Path, options: ReadOptions, gather: Gather[T]) -> T:
     try:
         refuse_foreign_zip(path)
     except ZIP_ERRORS as error:
         raise MapError(f"{path}: is a truncated or damaged zip: {error}") from error
-    return read_sog(path, options)
+    return read_sog(path, options, gather)
 
 
-def _read_json(path: Path, options: ReadOptions) -> GaussianMap:
+def _read_json(path: Path, options: ReadOptions, gather: Gather[T]) -> T:
     try:
         meta = json.loads(read_packed(path, path, _MAX_JSON_BYTES))
     except (ValueError, RecursionError) as error:
         raise MapError(f"{path}: is a damaged JSON file: {error}") from error
     if isinstance(meta, dict) and {"lodLevels", "tree"} <= set(meta):
-        return read_streamed_sog(path, meta, options)
+        return read_streamed_sog(path, meta, options, gather)
     if is_gsplat_png(meta):
-        return read_gsplat_png(path, meta, options)
+        return read_gsplat_png(path, meta, options, gather)
     refuse_foreign_json(path, meta)
-    return read_unbundled_sog(path, options)
+    return read_unbundled_sog(path, options, gather)

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -73,6 +73,11 @@ class Block(NamedTuple):
     step: np.ndarray | float = 0.0
 
 
+T = TypeVar("T")
+# What is made of a map's path, layout and blocks: by `assemble` a GaussianMap.
+Gather = Callable[[Path, Layout, Iterable[Block], ReadOptions], T]
+
+
 def check_count(path: Path, count: int) -> None:
     """Refuse a map of no Gaussians or of more than MAX_GAUSSIANS, before memory is taken for them."""
     if count == 0:
@@ -130,47 +135,76 @@ def assemble(path: Path, layout: Layout, blocks: Iterable[Block], options: ReadO
         MapError: more than 1 % of the rows would be left out, positions are coarser than the Gaussians, or there is too
             little memory.
     """
-    count, sh_coefficients = layout.count, layout.sh_coefficients
-    antialiased, antialiased_notes = _antialiased(layout, options)
-    check_memory(path, count * (_LOADED_BYTES + _COEFFICIENT_BYTES * sh_coefficients))
-    gaussian_map = GaussianMap(
+    check_memory(path, layout.count * (_LOADED_BYTES + _COEFFICIENT_BYTES * layout.sh_coefficients))
+    gaussian_map = empty_map(layout.count, layout.sh_coefficients)
+    intake, kept = Intake(path, layout, options), 0
+    for block in blocks:
+        kept += intake.take(block, gaussian_map, kept)
+    if kept < layout.count:
+        gaussian_map = replace(gaussian_map, **{name: getattr(gaussian_map, name)[:kept] for name in _ARRAYS})
+    return intake.described(gaussian_map)
+
+
+def empty_map(count: int, sh_coefficients: int) -> GaussianMap:
+    """Return a map with room for `count` Gaussians."""
+    return GaussianMap(
         means=np.empty((count, 3), np.float32),
         scales=np.empty((count, 3), np.float32),
         rotations=np.empty((count, 4), np.float32),
         opacities=np.empty(count, np.float32),
         sh=np.empty((count, sh_coefficients, 3), np.float32),
-        antialiased=antialiased,
     )
-    offset: np.ndarray | None = None
-    read, kept, first_invalid, steps = 0, 0, 0, _Steps()
-    # What does not fit into float32 becomes infinite and is left out by its value.
-    with np.errstate(over="ignore", invalid="ignore"):
-        for block in blocks:
-            if offset is None:
-                offset = _offset(block.means)
-            valid = _store(gaussian_map, kept, block, offset)
-            first_invalid = read + int(valid.argmin()) if kept == read and not valid.all() else first_invalid
-            stored = int(np.count_nonzero(valid))
-            steps.take(block, gaussian_map.scales[kept : kept + stored], valid)
-            read, kept = read + len(valid), kept + stored
-    invalid = read - kept
-    if invalid:
-        what = (
-            f"{invalid} of {count} Gaussians have values that are NaN, infinite or too large, or a rotation quaternion "
-            f"of zero length, the first is number {first_invalid}"
+
+
+class Intake:
+    """Takes the blocks of a map one after another: leaves out what holds no Gaussian, and notes what there is to say.
+
+    Args:
+        path, layout, options: as for `assemble`.
+    """
+
+    def __init__(self, path: Path, layout: Layout, options: ReadOptions) -> None:
+        self._path, self._layout = path, layout
+        self._antialiased, self._notes = _antialiased(layout, options)
+        self._offset: np.ndarray | None = None
+        self._read = self._kept = self._first_invalid = 0
+        self._steps = _Steps()
+
+    def take(self, block: Block, gaussian_map: GaussianMap, start: int) -> int:
+        """Put the Gaussians of a block into a map's arrays, from row `start` on; return how many."""
+        if self._offset is None:
+            self._offset = _offset(block.means)
+        valid = _store(gaussian_map, start, block, self._offset)
+        if self._kept == self._read and not valid.all():
+            self._first_invalid = self._read + int(valid.argmin())
+        stored = int(np.count_nonzero(valid))
+        self._steps.take(block, gaussian_map.scales[start : start + stored], valid)
+        self._read, self._kept = self._read + len(valid), self._kept + stored
+        return stored
+
+    def described(self, gaussian_map: GaussianMap) -> GaussianMap:
+        """Return a map with what is known of all blocks: where it lies, how it is drawn, what there is to say.
+
+        Raises:
+            MapError: too many rows hold no Gaussian, or positions are too coarse.
+        """
+        invalid = self._read - self._kept
+        notes = [*self._layout.notes, *self._notes, *self._steps.notes(self._kept)]
+        if invalid:
+            what = (
+                f"{invalid} of {self._layout.count} Gaussians have values that are NaN, infinite or too large, or a "
+                f"rotation quaternion of zero length, the first is number {self._first_invalid}"
+            )
+            if invalid > _MAX_INVALID_SHARE * self._layout.count:
+                raise MapError(f"{self._path}: {what}; up to {_MAX_INVALID_SHARE:.0%} of such would be left out")
+            notes.append(f"{what}: left out")
+        self._steps.check(self._path, self._kept)
+        return replace(
+            gaussian_map,
+            antialiased=self._antialiased,
+            S_map_splat=Similarity(translation=np.zeros(3) if self._offset is None else self._offset),
+            reading=Reading(tuple(notes), invalid, self._layout.other),
         )
-        if invalid > _MAX_INVALID_SHARE * count:
-            raise MapError(f"{path}: {what}; up to {_MAX_INVALID_SHARE:.0%} of such would be left out")
-        arrays = {name: getattr(gaussian_map, name)[:kept] for name in _ARRAYS}
-        gaussian_map = replace(gaussian_map, **arrays)
-    steps.check(path, kept)
-    notes = [*layout.notes, *antialiased_notes, *steps.notes(kept)]
-    notes += [f"{what}: left out"] if invalid else []
-    return replace(
-        gaussian_map,
-        S_map_splat=Similarity(translation=np.zeros(3) if offset is None else offset),
-        reading=Reading(tuple(notes), invalid, layout.other),
-    )
 
 
 def _antialiased(layout: Layout, options: ReadOptions) -> tuple[bool, list[str]]:

@@ -65,10 +65,6 @@ class GaussianMap:
     def __len__(self) -> int:
         return len(self.means)
 
-    def with_note(self, note: str) -> GaussianMap:
-        """Return the same with one more thing to say of how its file was read."""
-        return replace(self, reading=replace(self.reading, notes=(note, *self.reading.notes)))
-
     def placed(self, S_map_file: Similarity) -> GaussianMap:
         """Return the same where the frame of its file lies elsewhere in the robot's map frame."""
         return replace(self, S_map_splat=S_map_file @ self.S_map_splat)

@@ -19,13 +19,14 @@ from gsfeatloc_ros.common.jpeg_png import read_header
 from gsfeatloc_ros.maps.assemble import (
     MAX_COMPRESSION_RATIO,
     Block,
+    Gather,
     Layout,
-    assemble,
+    T,
     block_slices,
     check_count,
     read_packed,
 )
-from gsfeatloc_ros.maps.gaussian_map import SH_COEFFICIENTS, GaussianMap, MapError
+from gsfeatloc_ros.maps.gaussian_map import SH_COEFFICIENTS, MapError
 from gsfeatloc_ros.maps.options import ReadOptions
 
 # What is stored of a Gaussian: the number of its values.
@@ -38,7 +39,7 @@ def is_gsplat_png(meta: object) -> bool:
     return bool(parts) and all(isinstance(part, dict) and "shape" in part and "files" not in part for part in parts)
 
 
-def read_gsplat_png(path: Path, meta: dict[str, Any], options: ReadOptions) -> GaussianMap:
+def read_gsplat_png(path: Path, meta: dict[str, Any], options: ReadOptions, gather: Gather[T]) -> T:
     """Read a map from the meta.json, already parsed, of a folder that gsplat wrote.
 
     Raises:
@@ -60,7 +61,7 @@ def read_gsplat_png(path: Path, meta: dict[str, Any], options: ReadOptions) -> G
     unused = [name for name in meta if name not in (*_VALUES, "shN")]
     notes = [f"values that are not used: {', '.join(unused)}"] if unused else []
     layout = Layout(count, min(coefficients, SH_COEFFICIENTS[-1]), None, tuple(notes))
-    return assemble(path, layout, _blocks(count, values, harmonics), options)
+    return gather(path, layout, _blocks(count, values, harmonics), options)
 
 
 def _values(path: Path, name: str, meta: dict[str, Any], count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

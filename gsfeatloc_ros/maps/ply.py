@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
 from plyfile import PlyData, PlyElement
 
 from gsfeatloc_ros.maps import compressed_ply
-from gsfeatloc_ros.maps.assemble import SH_C0, Block, Layout, assemble, check_count, single_precision_step
+from gsfeatloc_ros.maps.assemble import SH_C0, Block, Gather, Layout, T, check_count, single_precision_step
 from gsfeatloc_ros.maps.gaussian_map import SH_COEFFICIENTS, GaussianMap, MapError
 from gsfeatloc_ros.maps.options import ReadOptions
 from gsfeatloc_ros.maps.ply_file import PlyFile, check_no_lists, columns
@@ -43,7 +43,7 @@ _EXPORT = "export it as 3D Gaussians, in the layout of the INRIA trainer"
 _MIN_OPACITY = 1e-7
 
 
-def read_ply(path: Path, options: ReadOptions) -> GaussianMap:
+def read_ply(path: Path, options: ReadOptions, gather: Gather[T]) -> T:
     """Read a map from a .ply file: ascii or binary, float or double, properties in any order, of any SH degree.
 
     PlayCanvas's compressed .ply is read as well.
@@ -64,7 +64,7 @@ def read_ply(path: Path, options: ReadOptions) -> GaussianMap:
     unused = [] if compressed else _unused(ply, coefficients)
     layout = Layout(vertex.count, used, _antialiased(ply), tuple(unused + _remarks(ply, compressed)))
     blocks = compressed_ply.blocks(ply, coefficients) if compressed else _blocks(ply, coefficients)
-    return assemble(path, layout, blocks, options)
+    return gather(path, layout, blocks, options)
 
 
 def write_ply(path: str | Path, gaussian_map: GaussianMap) -> None:
@@ -72,9 +72,26 @@ def write_ply(path: str | Path, gaussian_map: GaussianMap) -> None:
 
     The file has no place for S_map_splat, so that is not written.
     """
+    write_ply_parts(path, [gaussian_map], len(gaussian_map))
+
+
+def write_ply_parts(path: str | Path, parts: Iterable[GaussianMap], count: int) -> None:
+    """Write the parts of a map, one after another, which are of `count` Gaussians together and all alike."""
+    with Path(path).open("wb") as stream:
+        for number, part in enumerate(parts):
+            vertices = _vertices(part)
+            if number == 0:
+                comments = ["SplatRenderMode: mip"] if part.antialiased else []
+                ply = PlyData([PlyElement.describe(vertices[:0], "vertex")], byte_order="<", comments=comments)
+                stream.write(ply.header.replace("element vertex 0", f"element vertex {count}").encode() + b"\n")
+            vertices.tofile(stream)
+
+
+def _vertices(gaussian_map: GaussianMap) -> np.ndarray:
+    """Return the rows of a file (N,), a field for each property."""
     opacities = np.clip(gaussian_map.opacities.astype(np.float64), _MIN_OPACITY, 1.0 - _MIN_OPACITY)
     # The file holds all harmonics of red, then of green, then of blue.
-    rest = gaussian_map.sh[:, 1:].transpose(0, 2, 1).reshape(len(gaussian_map), -1)
+    rest = gaussian_map.sh[:, 1:].transpose(0, 2, 1).reshape(len(gaussian_map), 3 * gaussian_map.sh.shape[1] - 3)
     groups = [
         (_MEANS, gaussian_map.means),
         (_NORMALS, np.zeros_like(gaussian_map.means)),
@@ -88,8 +105,7 @@ def write_ply(path: str | Path, gaussian_map: GaussianMap) -> None:
     for names, values in groups:
         for name, column in zip(names, values.T, strict=True):
             vertices[name] = column
-    comments = ["SplatRenderMode: mip"] if gaussian_map.antialiased else []
-    PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<", comments=comments).write(str(path))
+    return vertices
 
 
 def _antialiased(ply: PlyFile) -> bool | None:

@@ -21,14 +21,15 @@ import numpy as np
 from gsfeatloc_ros.maps.assemble import (
     MAX_PACKED_BYTES,
     Block,
+    Gather,
     Layout,
-    assemble,
+    T,
     block_slices,
     check_compression,
     check_count,
     read_packed,
 )
-from gsfeatloc_ros.maps.gaussian_map import SH_COEFFICIENTS, GaussianMap, MapError
+from gsfeatloc_ros.maps.gaussian_map import SH_COEFFICIENTS, MapError
 from gsfeatloc_ros.maps.options import ReadOptions
 
 # A meta.json with all codebooks takes 16 KB.
@@ -66,7 +67,7 @@ class _Sog:
     files: dict[str, list[str]]
 
 
-def read_sog(path: Path, options: ReadOptions) -> GaussianMap:
+def read_sog(path: Path, options: ReadOptions, gather: Gather[T]) -> T:
     """Read a map from a .sog file, a zip of its files or of the folder with them.
 
     Raises:
@@ -78,7 +79,7 @@ def read_sog(path: Path, options: ReadOptions) -> GaussianMap:
             folder = _folder_of_meta(path, archive)
             meta_json = _read_member(path, archive, folder + "meta.json", _MAX_META_BYTES)
             layout, blocks = open_sog(path, meta_json, lambda name: _read_member(path, archive, folder + name))
-            return assemble(path, layout, blocks, options)
+            return gather(path, layout, blocks, options)
     except ZIP_ERRORS as error:
         raise MapError(f"{path}: is truncated or damaged: {error}") from error
 
@@ -94,14 +95,14 @@ def read_meta(path: Path) -> object:
         raise MapError(f"{path}: is truncated or damaged: {error}") from error
 
 
-def read_unbundled_sog(path: Path, options: ReadOptions) -> GaussianMap:
+def read_unbundled_sog(path: Path, options: ReadOptions, gather: Gather[T]) -> T:
     """Read a map from the meta.json of an unbundled .sog.
 
     Raises:
         MapError: a file is missing, truncated, damaged, of another version or not lossless.
         OSError: one cannot be read.
     """
-    return assemble(path, *open_unbundled_sog(path), options)
+    return gather(path, *open_unbundled_sog(path), options)
 
 
 def open_unbundled_sog(path: Path) -> tuple[Layout, Iterator[Block]]:

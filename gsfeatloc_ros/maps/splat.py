@@ -13,13 +13,14 @@ import numpy as np
 from gsfeatloc_ros.maps.assemble import (
     SH_C0,
     Block,
+    Gather,
     Layout,
-    assemble,
+    T,
     block_slices,
     check_count,
     single_precision_step,
 )
-from gsfeatloc_ros.maps.gaussian_map import GaussianMap, MapError
+from gsfeatloc_ros.maps.gaussian_map import MapError
 from gsfeatloc_ros.maps.options import ReadOptions
 
 _ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("rotation", "u1", 4)])
@@ -31,7 +32,7 @@ _MAX_POSITION, _MAX_SCALE = 1e8, 1e6
 _MAX_IMPLAUSIBLE_SHARE = 0.01
 
 
-def read_splat(path: Path, options: ReadOptions) -> GaussianMap:
+def read_splat(path: Path, options: ReadOptions, gather: Gather[T]) -> T:
     """Read a map from a .splat file.
 
     Raises:
@@ -47,7 +48,7 @@ def read_splat(path: Path, options: ReadOptions) -> GaussianMap:
         )
     check_count(path, count)
     _check_plausible(path, count)
-    return assemble(path, Layout(count, 1), _blocks(path, count), options)
+    return gather(path, Layout(count, 1), _blocks(path, count), options)
 
 
 def _rows(path: Path, count: int) -> Iterator[np.ndarray]:

@@ -17,14 +17,15 @@ from backports import zstd
 from gsfeatloc_ros.common.geometry import quaternion_from_matrix
 from gsfeatloc_ros.maps.assemble import (
     Block,
+    Gather,
     Layout,
-    assemble,
+    T,
     block_slices,
     check_compression,
     check_count,
     read_packed,
 )
-from gsfeatloc_ros.maps.gaussian_map import SH_COEFFICIENTS, GaussianMap, MapError
+from gsfeatloc_ros.maps.gaussian_map import SH_COEFFICIENTS, MapError
 from gsfeatloc_ros.maps.harmonics import turned
 from gsfeatloc_ros.maps.options import ReadOptions
 
@@ -64,7 +65,7 @@ class _Extensions:
     unknown: tuple[int, ...] = ()
 
 
-def read_spz(path: Path, options: ReadOptions) -> GaussianMap:
+def read_spz(path: Path, options: ReadOptions, gather: Gather[T]) -> T:
     """Read a map from an .spz file of version 1 to 4 and turn it to the axes of the .ply that it was made from.
 
     Raises:
@@ -86,7 +87,7 @@ def read_spz(path: Path, options: ReadOptions) -> GaussianMap:
         notes.append(f"spherical harmonics of degree {header.sh_degree} are read to degree 3")
     used = SH_COEFFICIENTS[min(header.sh_degree, len(SH_COEFFICIENTS) - 1)]
     layout = Layout(header.count, used, bool(header.flags & _ANTIALIASED), tuple(notes), other)
-    return assemble(path, layout, _blocks(header, streams, *_to_ply(axes)), options)
+    return gather(path, layout, _blocks(header, streams, *_to_ply(axes)), options)
 
 
 def _choose_axes(extensions: _Extensions, options: ReadOptions) -> tuple[int, list[str], str]:

@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from gsfeatloc_ros.maps.assemble import Block, Layout, assemble, check_count
-from gsfeatloc_ros.maps.gaussian_map import GaussianMap, MapError
+from gsfeatloc_ros.maps.assemble import Block, Gather, Layout, T, check_count
+from gsfeatloc_ros.maps.gaussian_map import MapError
 from gsfeatloc_ros.maps.options import ReadOptions
 from gsfeatloc_ros.maps.sog import describe_unbundled_sog, open_unbundled_sog
 
@@ -28,7 +28,7 @@ class _Unit:
     ranges: list[tuple[int, int]] | None
 
 
-def read_streamed_sog(path: Path, meta: dict[str, Any], options: ReadOptions) -> GaussianMap:
+def read_streamed_sog(path: Path, meta: dict[str, Any], options: ReadOptions, gather: Gather[T]) -> T:
     """Read one level of detail of a map from its lod-meta.json, already parsed, with the environment if there is one.
 
     Raises:
@@ -55,7 +55,7 @@ def read_streamed_sog(path: Path, meta: dict[str, Any], options: ReadOptions) ->
         raise MapError(f"{path}: some of its parts are trained antialiased and others not: write it again")
     coefficients = max(layout.sh_coefficients for layout in layouts)
     layout = Layout(sum(counts), coefficients, layouts[0].antialiased, tuple(notes))
-    return assemble(path, layout, _blocks(units, coefficients), options)
+    return gather(path, layout, _blocks(units, coefficients), options)
 
 
 def _parse(path: Path, meta: dict[str, Any], level: int) -> tuple[int, list[_Unit]]:

@@ -10,7 +10,7 @@ from gsfeatloc_ros.maps.gaussian_map import GaussianMap
 from gsfeatloc_ros.render.base import DEFAULT_DRAW_OPTIONS, DrawOptions, Render, Renderer, SplatRenderer
 
 if TYPE_CHECKING:
-    from gsfeatloc_ros.render.prepare import PreparedMap
+    from gsfeatloc_ros.render.chunks import PreparedMap
 
 __all__ = ["DEVICES", "DrawOptions", "Render", "Renderer", "SplatRenderer", "create_renderer"]
 

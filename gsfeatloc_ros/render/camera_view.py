@@ -72,6 +72,16 @@ def visible_chunks(view: CameraView, low: np.ndarray, high: np.ndarray) -> np.nd
     side of the frustum is linearised at a slope up to a margin further out: it reaches further in than its box by at
     most that margin times its extent in depth.
     """
+    return _chunks_inside(low, high, view.origin, *frustum(view))
+
+
+def frustum(view: CameraView) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the sides that `is_outside` holds boxes against: four of the frustum, and the near plane.
+
+    Returns:
+        Normals (5, 3) that point inwards, splat frame; how much further in than its box a Gaussian may reach, as a
+        share of the box's extent in depth (5,); the least distances along the normals (5,).
+    """
     left, right = ((-_MAX_BLUR - view.cx) / view.fx, (view.width - 1 + _MAX_BLUR - view.cx) / view.fx)
     top, bottom = ((-_MAX_BLUR - view.cy) / view.fy, (view.height - 1 + _MAX_BLUR - view.cy) / view.fy)
     inward = np.array(
@@ -79,7 +89,7 @@ def visible_chunks(view: CameraView, low: np.ndarray, high: np.ndarray) -> np.nd
     ) @ view.rotation.astype(np.float64)
     margins = np.abs([left - view.left, view.right - right, top - view.top, view.bottom - bottom, 0.0])
     limits = np.array([0.0, 0.0, 0.0, 0.0, NEAR_PLANE])
-    return _chunks_inside(low, high, view.origin, inward, margins, limits)
+    return inward, margins, limits
 
 
 @njit(nogil=True, cache=True)
@@ -87,18 +97,24 @@ def _chunks_inside(low, high, origin, inward, margins, limits):
     chunks = np.empty(len(low), dtype=np.int64)
     count = 0
     for chunk in range(len(low)):
-        outside = False
-        for side in range(len(inward)):
-            furthest = rounding = 0.0
-            for axis in range(3):
-                center = 0.5 * (np.float64(low[chunk, axis]) + high[chunk, axis]) - origin[axis]
-                half = 0.5 * (np.float64(high[chunk, axis]) - low[chunk, axis])
-                normal, depth_axis = inward[side, axis], inward[-1, axis]
-                furthest += normal * center + (abs(normal) + margins[side] * abs(depth_axis)) * half
-                rounding += 1e-5 * abs(normal) * (abs(center) + half)
-            # False for what is not finite: that is for the projection to judge.
-            outside |= furthest + rounding < limits[side]
-        if not outside:
+        if not is_outside(low[chunk], high[chunk], origin, inward, margins, limits):
             chunks[count] = chunk
             count += 1
     return chunks[:count]
+
+
+@njit
+def is_outside(low, high, origin, inward, margins, limits):
+    """Return whether nothing in a box, `low` to `high` (3,), is seen from `origin`; the rest is of `frustum`."""
+    outside = False
+    for side in range(len(inward)):
+        furthest = rounding = 0.0
+        for axis in range(3):
+            center = 0.5 * (np.float64(low[axis]) + high[axis]) - origin[axis]
+            half = 0.5 * (np.float64(high[axis]) - low[axis])
+            normal, depth_axis = inward[side, axis], inward[-1, axis]
+            furthest += normal * center + (abs(normal) + margins[side] * abs(depth_axis)) * half
+            rounding += 1e-5 * abs(normal) * (abs(center) + half)
+        # False for what is not finite: that is for the projection to judge.
+        outside |= furthest + rounding < limits[side]
+    return outside

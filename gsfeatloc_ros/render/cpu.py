@@ -11,10 +11,12 @@ from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.maps.gaussian_map import SH_COEFFICIENTS, GaussianMap
 from gsfeatloc_ros.render.base import DEFAULT_DRAW_OPTIONS, DrawOptions, Render, SplatRenderer, Stage, check_range
 from gsfeatloc_ros.render.blend import blend, gather, tile_starts
-from gsfeatloc_ros.render.camera_view import camera_view, visible_chunks
+from gsfeatloc_ros.render.camera_view import camera_view
+from gsfeatloc_ros.render.chunks import CHUNK, KERNEL_LOCK, PreparedMap
+from gsfeatloc_ros.render.cut import Cut
 from gsfeatloc_ros.render.enlarge import draw_scaled
 from gsfeatloc_ros.render.kernels import max_threads, set_threads
-from gsfeatloc_ros.render.prepare import CHUNK, KERNEL_LOCK, PreparedMap, prepare
+from gsfeatloc_ros.render.prepare import prepare
 from gsfeatloc_ros.render.project import SPLAT_SIZE, TILE, project
 
 _MAX_THREADS = 1024
@@ -45,7 +47,7 @@ class CpuRenderer(SplatRenderer):
         self._background = np.asarray(options.background, dtype=np.float32)
         self._resolution_scale = options.resolution_scale
         self._antialiased = prepared.antialiased
-        self._low, self._high = prepared.low, prepared.high
+        self._cut = Cut(prepared)
         self._gaussians = prepared.gaussians.reshape(-1)
         self._sh = prepared.sh.view(np.int16).reshape(-1)
         stored = prepared.sh_coefficients
@@ -64,7 +66,7 @@ class CpuRenderer(SplatRenderer):
     def _draw_alone(self, camera: Camera, T_splat_camera: np.ndarray, stage: Stage) -> Render:
         view = camera_view(camera, T_splat_camera)
         with stage("cull"):
-            chunks = visible_chunks(view, self._low, self._high)
+            chunks = self._cut.chunks(view)
         if len(self._splats) < len(chunks) * CHUNK * SPLAT_SIZE:
             self._splats = np.empty(len(chunks) * CHUNK * SPLAT_SIZE, dtype=np.float32)
         tiles = -(-camera.width // TILE) * -(-camera.height // TILE)

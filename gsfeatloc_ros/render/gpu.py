@@ -23,10 +23,11 @@ from gsfeatloc_ros.render.base import (
     Stage,
     unmeasured,
 )
+from gsfeatloc_ros.render.chunks import PreparedMap
 from gsfeatloc_ros.render.cpu import CpuRenderer
 from gsfeatloc_ros.render.depth_bins import DepthBins
 from gsfeatloc_ros.render.enlarge import draw_scaled
-from gsfeatloc_ros.render.prepare import PreparedMap, prepare
+from gsfeatloc_ros.render.prepare import prepare
 
 # What the pictures of the self-check must agree in with the CPU's. Rounding leaves more than 60 dB; half a pixel or a
 # mirrored axis, less than 40.

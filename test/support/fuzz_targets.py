@@ -8,6 +8,7 @@ from __future__ import annotations
 import gzip
 import hashlib
 import json
+import math
 import struct
 import warnings
 import zlib
@@ -31,9 +32,9 @@ from gsfeatloc_ros.evaluate import colmap, nerfstudio
 from gsfeatloc_ros.index import storage
 from gsfeatloc_ros.index.storage import load_index, save_index
 from gsfeatloc_ros.maps import GaussianMap, load_map, read_dataparser_transforms
+from gsfeatloc_ros.maps.gaussian_map import Reading
 from gsfeatloc_ros.maps.ply import write_ply
-from gsfeatloc_ros.render import cache
-from gsfeatloc_ros.render.prepare import PreparedMap
+from gsfeatloc_ros.render import cache_file
 from gsfeatloc_ros.replay.bag import Role, open_bag
 from gsfeatloc_ros.ros_io.calibration import decode_camera
 from gsfeatloc_ros.ros_io.decode import decode_pose
@@ -41,6 +42,7 @@ from gsfeatloc_ros.ros_io.raw_image import decode_image
 from gsfeatloc_ros.ros_io.saved_pose import load_pose, save_pose
 
 _ORIGIN = {"code": "c", "map": [[1, "d"]]}
+_CACHES = [cache_file.Header(2, coarser, 4, False, (0.0, 0.0, 0.0), Reading()) for coarser in (False, True)]
 _TYPES = get_typestore(Stores.ROS2_JAZZY)
 
 
@@ -87,11 +89,13 @@ def _unpacked_spz(path: Path, sample: GaussianMap, version: int) -> Target:
 
 def _kept(folder: Path) -> dict[str, Target]:
     """What the package itself wrote, with checksums that fit."""
-    prepared = PreparedMap(*(np.zeros(shape, dtype) for dtype, shape in cache._layout(2, 4).values()))
     path = folder / "kept"
-    with path.open("wb") as file:
-        cache._write(file, prepared, _ORIGIN)
-    found = {"cache": Target([path.read_bytes()], _read_cache, _signed_cache)}
+    caches = []
+    for header in _CACHES:
+        with path.open("w+b") as file:
+            cache_file.seal(file, cache_file.create(file, header, _ORIGIN))
+        caches.append(path.read_bytes())
+    found = {"cache": Target(caches, _read_cache, _signed_cache)}
     save_index(path, made_up_index(views=3, features=4, dimension=64).index, {"map": 1})
     index = path.read_bytes()
     found["index"] = Target([index], load_index, _signed_index)
@@ -103,14 +107,24 @@ def _kept(folder: Path) -> dict[str, Target]:
 def _read_cache(path: Path) -> Any:
     try:
         with path.open("rb") as stream:
-            return cache._read(stream, _ORIGIN)
-    except cache._CacheError as error:
+            return cache_file.read(stream, _ORIGIN, large=256)
+    except cache_file.CacheError as error:
         raise ValueError(str(error)) from error
 
 
 def _signed_cache(content: bytes) -> bytes:
-    start = len(cache._MAGIC)
-    return content[:start] + zlib.crc32(content[start + 8 :]).to_bytes(4, "little") + content[start + 4 :]
+    """With checksums that fit, those of the arrays where all of them are there."""
+    start = len(cache_file.MAGIC)
+    numbers = start + 4 * (2 + len(cache_file.ARRAYS))
+    end = numbers + int.from_bytes(content[start : start + 4], "little")
+    parts = [content[numbers:end]]
+    for header in _CACHES:
+        sizes = [np.dtype(dtype).itemsize * math.prod(shape) for dtype, shape in header.layout().values()]
+        if end + sum(sizes) == len(content):
+            ends = end + np.cumsum(sizes)
+            parts += [content[place - size : place] for place, size in zip(ends, sizes, strict=True)]
+    signed = b"".join(zlib.crc32(part).to_bytes(4, "little") for part in parts)
+    return content[: start + 4] + signed + content[start + 4 + len(signed) :]
 
 
 def _signed_index(content: bytes) -> bytes:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import logging
+import mmap
 import os
 import stat
 import zlib
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import map_files
 import numpy as np
@@ -19,9 +21,10 @@ from hypothesis import strategies as st
 from gsfeatloc_ros.common.geometry import so3_exp
 from gsfeatloc_ros.maps import MapError, Similarity, load_map
 from gsfeatloc_ros.maps.ply import write_ply
-from gsfeatloc_ros.render import cache
+from gsfeatloc_ros.render import cache, cache_file, prepare_large
 from gsfeatloc_ros.render.cache import load_prepared
-from gsfeatloc_ros.render.prepare import LOG2_OPACITY, MEAN_X, PreparedMap, prepare
+from gsfeatloc_ros.render.chunks import LOG2_OPACITY, MEAN_X, PreparedMap
+from gsfeatloc_ros.render.prepare import prepare
 from gsfeatloc_ros.simulate.two_rooms import two_rooms
 
 ARRAYS = [field.name for field in fields(PreparedMap) if "ndarray" in str(field.type)]
@@ -174,7 +177,7 @@ def damaged_copies(content: bytes) -> dict[str, bytes]:
         "cut in the arrays": content[:-1000],
         "longer": content + b"\0",
         "with a hole": content[:-5000] + bytes(5000),
-        "with an endless header": content[: header - 4] + b"\xff" * 4 + content[header:],
+        "with an endless header": cache_file.MAGIC + b"\xff" * 4 + content[len(cache_file.MAGIC) + 4 :],
         "with a header of lists": content[:header] + b"[" * (len(content) - header),
     }
 
@@ -207,46 +210,50 @@ def test_no_flipped_byte_goes_unnoticed(map_file, data):
     assert_same(load_prepared(map_file), expected)
 
 
-def forged(map_path: Path, **header) -> None:
-    """Change the cache's header, with a checksum that fits."""
+def forged(map_path: Path, **lies) -> None:
+    """Change what the cache's header says of the map, with a checksum that fits."""
     content = cache_of(map_path).read_bytes()
-    start = len(cache._MAGIC) + 8
-    end = start + int.from_bytes(content[start - 4 : start], "little")
-    encoded = json.dumps(json.loads(content[start:end]) | header).encode()
-    checksum = zlib.crc32(content[end:], zlib.crc32(encoded))
-    parts = [content[: start - 8], checksum.to_bytes(4, "little"), len(encoded).to_bytes(4, "little"), encoded]
-    cache_of(map_path).write_bytes(b"".join([*parts, content[end:]]))
+    start = len(cache_file.MAGIC)
+    header = start + 4 * (2 + len(cache_file.ARRAYS))
+    end = header + int.from_bytes(content[start : start + 4], "little")
+    values = json.loads(content[header:end])
+    encoded = json.dumps(values | {"map": values["map"] | lies}).encode()
+    numbers = len(encoded).to_bytes(4, "little") + zlib.crc32(encoded).to_bytes(4, "little")
+    cache_of(map_path).write_bytes(content[:start] + numbers + content[start + 8 : header] + encoded + content[end:])
 
 
 @pytest.mark.parametrize(
     ("lie", "says"),
     [
-        ({"chunks": 2**24}, "is truncated"),
-        ({"chunks": 10**400}, "is damaged"),
-        ({"chunks": -1}, "is damaged"),
-        ({"chunks": 1.0}, "is damaged"),
-        ({"chunks": None}, "is damaged"),
+        ({"leaves": 2**24}, "is truncated"),
+        ({"leaves": 10**400}, "is damaged"),
+        ({"leaves": -1}, "is damaged"),
+        ({"leaves": 1.0}, "is damaged"),
+        ({"leaves": None}, "is damaged"),
         ({"sh_coefficients": 9}, "is truncated"),
         ({"sh_coefficients": 0}, "is damaged"),
         ({"sh_coefficients": [16]}, "is damaged"),
         ({"antialiased": 1}, "is damaged"),
+        ({"coarser": True}, "is truncated"),
+        ({"coarser": 0}, "is damaged"),
+        ({"more": 0}, "is damaged"),
+        ({"offset": [0, 0]}, "is damaged"),
     ],
 )
 def test_shapes_that_the_arrays_cannot_have_are_refused_before_memory_is_taken(map_file, caplog, lie, says):
     load_prepared(map_file)
     forged(map_file, **lie)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(cache.np, "fromfile", lambda *arguments: pytest.fail("memory is taken"))
-        with cache_of(map_file).open("rb") as stream, pytest.raises(cache._CacheError, match=says):
-            cache._read(stream, cache_origin(map_file))
+        patch.setattr(cache_file.np, "fromfile", lambda *arguments: pytest.fail("memory is taken"))
+        with cache_of(map_file).open("rb") as stream, pytest.raises(cache_file.CacheError, match=says):
+            cache_file.read(stream, cache_origin(map_file))
     load_prepared(map_file)
     assert says in caplog.text
 
 
 def cache_origin(map_path: Path) -> dict:
-    content = cache_of(map_path).read_bytes()
-    start = len(cache._MAGIC) + 8
-    return json.loads(content[start : start + int.from_bytes(content[start - 4 : start], "little")])["origin"]
+    text = cache_of(map_path).read_bytes().decode("latin-1")
+    return json.JSONDecoder().raw_decode(text, text.index("{"))[0]["origin"]
 
 
 @pytest.mark.parametrize(
@@ -254,7 +261,7 @@ def cache_origin(map_path: Path) -> dict:
     [
         ("gaussians", np.s_[0, MEAN_X, 3], np.nan),
         ("gaussians", np.s_[0, MEAN_X, 3], np.inf),
-        ("gaussians", np.s_[0, LOG2_OPACITY, 3], 2.0),
+        ("gaussians", np.s_[0, LOG2_OPACITY, 3], 2.1),
         ("gaussians", np.s_[0, LOG2_OPACITY, 3], np.nan),
         ("sh", np.s_[0, 0, 3], np.inf),
         ("sh", np.s_[0, 0, 3], np.nan),
@@ -265,8 +272,8 @@ def test_values_that_no_map_gives_are_damage(map_file, caplog, preparations, arr
     prepared = load_prepared(map_file)
     origin = cache_origin(map_file)
     getattr(prepared, array)[where] = value
-    with cache_of(map_file).open("wb") as stream:
-        cache._write(stream, prepared, origin)
+    with cache_of(map_file).open("w+b") as stream:
+        cache_file.write(stream, prepared, origin)
     load_prepared(map_file)
     assert "is damaged" in caplog.text
     assert len(preparations) == 2
@@ -277,8 +284,8 @@ def moved(map_path: Path) -> None:
     prepared = load_prepared(map_path)
     prepared.gaussians[:, MEAN_X] += 1.0
     origin = cache_origin(map_path)
-    with cache_of(map_path).open("wb") as stream:
-        cache._write(stream, prepared, origin)
+    with cache_of(map_path).open("w+b") as stream:
+        cache_file.write(stream, prepared, origin)
 
 
 def test_a_cache_that_others_can_have_written_is_not_believed(map_file, caplog, preparations, untrusted):
@@ -291,6 +298,87 @@ def test_a_cache_that_others_can_have_written_is_not_believed(map_file, caplog, 
     load_prepared(map_file)
     assert len(preparations) == 2
     assert stat.S_IMODE(cache_of(map_file).lstat().st_mode) == 0o644
+
+
+def test_a_large_map_is_mapped_and_the_file_is_not_written_to(map_file):
+    prepared = prepare(load_map(map_file), large=100)
+    with cache_of(map_file).open("w+b") as stream:
+        cache_file.write(stream, prepared, {})
+    content = cache_of(map_file).read_bytes()
+    with cache_of(map_file).open("rb") as stream:
+        mapped = cache_file.read(stream, {}, large=100)
+    assert mapped is not None
+    assert_same(mapped, prepared)
+    assert mapped.leaves == prepared.leaves < len(prepared.sizes)
+    for name in ARRAYS:
+        array = getattr(mapped, name)
+        assert array.flags.c_contiguous
+        assert array.flags.writeable
+        assert isinstance(array.base.base.obj, mmap.mmap)
+        array[...] = 0
+    assert cache_of(map_file).read_bytes() == content
+
+
+def test_no_flipped_byte_of_a_large_map_goes_unnoticed(map_file):
+    with cache_of(map_file).open("w+b") as stream:
+        cache_file.write(stream, prepare(load_map(map_file), large=100), {})
+    content = cache_of(map_file).read_bytes()
+    for place in np.random.default_rng(0).integers(len(cache_file.MAGIC), len(content), 50):
+        changed = bytearray(content)
+        changed[place] ^= 1
+        cache_of(map_file).write_bytes(changed)
+        with cache_of(map_file).open("rb") as stream, pytest.raises(cache_file.CacheError):
+            cache_file.read(stream, {}, large=100)
+
+
+@pytest.fixture
+def all_are_large(monkeypatch) -> None:
+    """Maps of more than 500 Gaussians, in buckets of a few."""
+    monkeypatch.setattr(cache, "LARGE_MAP", 500)
+    monkeypatch.setattr(prepare_large, "_BUCKET_BYTES", 20_000)
+
+
+@pytest.mark.parametrize("sh_degree", [0, 3])
+@pytest.mark.usefixtures("all_are_large")
+def test_a_large_map_prepared_on_disk_is_the_same_as_one_prepared_in_memory(tmp_path, sh_degree: int, preparations):
+    gaussian_map = map_files.sample_map(3000, sh_degree, seed=0)
+    path = tmp_path / "map.ply"
+    write_ply(path, replace(gaussian_map, opacities=np.maximum(gaussian_map.opacities, 0.01), antialiased=True))
+    on_disk = load_prepared(path)
+    assert not preparations
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["map.ply", "map.ply.gsfeatloc-cache"]
+    in_memory = prepare(load_map(path), large=500)
+    assert_same(on_disk, in_memory)
+    assert on_disk.reading == in_memory.reading
+    assert on_disk.leaves < len(on_disk.sizes)
+
+
+@pytest.mark.usefixtures("all_are_large")
+def test_what_cannot_be_seen_of_a_large_map_is_left_out(tmp_path):
+    gaussian_map = map_files.sample_map(3000, 0, seed=0)
+    path = tmp_path / "map.ply"
+    write_ply(path, replace(gaussian_map, opacities=np.where(np.arange(3000) % 3, gaussian_map.opacities, 0.0)))
+    loaded = load_map(path)
+    assert load_prepared(path).unpacked(0).means.shape == (np.count_nonzero(loaded.opacities >= 1 / 255), 3)
+    write_ply(path, replace(gaussian_map, opacities=np.zeros(3000, np.float32)))
+    with pytest.raises(MapError, match="nothing in it can be seen"):
+        load_prepared(path)
+
+
+@pytest.mark.usefixtures("all_are_large")
+def test_a_large_map_whose_cache_cannot_be_written_is_prepared_in_memory(map_file, caplog):
+    cache_of(map_file).mkdir()
+    assert_same(load_prepared(map_file), prepare(load_map(map_file)))
+    assert "the map is prepared in memory" in caplog.text
+    assert not list(map_file.parent.glob(".*"))
+
+
+@pytest.mark.usefixtures("all_are_large")
+def test_a_large_map_for_which_there_is_no_disk_is_refused(map_file, monkeypatch):
+    monkeypatch.setattr(prepare_large.shutil, "disk_usage", lambda folder: SimpleNamespace(free=1000))
+    with pytest.raises(MapError, match="make room there"):
+        load_prepared(map_file)
+    assert [file.name for file in map_file.parent.iterdir()] == ["map.ply"]
 
 
 def test_content_is_that_of_a_copy_and_not_of_another_map(map_file, tmp_path) -> None:
