@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsfeatloc_ros.common.geometry import make_pose
-from gsfeatloc_ros.maps.assemble import SH_C0
-from gsfeatloc_ros.maps.gaussian_map import SH_COEFFICIENTS, GaussianMap
+from gsfeatloc_ros.maps.gaussian_map import GaussianMap
+from gsfeatloc_ros.simulate.boxes import cover_boxes, looking_at
 
 # Boxes by their lowest and highest corner, in metres, z up: two rooms with a door between them, and what stands there.
 _BOXES = (
@@ -21,78 +20,13 @@ _BOXES = (
 )
 _DOOR = ((4.9, 1.5, 0.0), (5.1, 2.6, 2.1))
 
-# Of trained maps: the standard deviation along a surface over the distance to the neighbours, and the spread of its
-# logarithm; that across the surface over that along it; how far Gaussians lie off the surface, in metres; the beta
-# distribution of opacities, of which most are faint; the harmonics' standard deviations by degree.
-_SIZE, _SIZE_SPREAD = 0.75, 0.5
-_FLATNESS = 0.15
-_ROUGHNESS = 0.01
-_OPACITIES = (0.9, 0.8)
-_HARMONICS = (0.1, 0.05, 0.03)
-
-
-def _looking_at(position: tuple[float, float, float], target: tuple[float, float, float]) -> np.ndarray:
-    """Return the pose T_map_camera (4, 4) of an upright camera."""
-    forward = np.subtract(target, position) / np.linalg.norm(np.subtract(target, position))
-    right = np.cross(forward, (0.0, 0.0, 1.0))
-    right /= np.linalg.norm(right)
-    return make_pose(np.column_stack([right, np.cross(forward, right), forward]), np.array(position))
-
-
 # What to measure from, T_map_camera (4, 4) by name: most of the map in view, and as on a robot's way.
 VIEWS = {
-    "everything": _looking_at((1.2, 2.9, 2.1), (6.0, 1.8, 1.1)),
-    "typical": _looking_at((4.8, 3.8, 1.6), (0.8, 1.2, 0.9)),
+    "everything": looking_at((1.2, 2.9, 2.1), (6.0, 1.8, 1.1)),
+    "typical": looking_at((4.8, 3.8, 1.6), (0.8, 1.2, 0.9)),
 }
 
 
 def two_rooms(count: int, seed: int = 0) -> GaussianMap:
     """Cover two furnished rooms with `count` Gaussians of SH degree 3, the smaller the more there are."""
-    rng = np.random.default_rng(seed)
-    means, normals, spacing = _scatter(count, rng)
-    each = np.arange(count)
-    scales = _SIZE * spacing * np.exp(_SIZE_SPREAD * rng.standard_normal((count, 3), dtype=np.float32))
-    scales[each, normals] *= _FLATNESS
-    # Turned about the normal, which is one of the axes.
-    half_angles = rng.uniform(0, np.pi, count)
-    rotations = np.zeros((count, 4), np.float32)
-    rotations[:, 0] = np.cos(half_angles)
-    rotations[each, 1 + normals] = np.sin(half_angles)
-    return GaussianMap(
-        means=means,
-        scales=scales.astype(np.float32),
-        rotations=rotations,
-        opacities=rng.beta(*_OPACITIES, count).astype(np.float32),
-        sh=_colours(means, rng),
-    )
-
-
-def _scatter(count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return points (N, 3) float32 on the boxes, the axes (N,) along their normals, and the distance of neighbours."""
-    corners = np.array(_BOXES)
-    sizes = corners[:, 1] - corners[:, 0]
-    # Of the two faces across each axis.
-    areas = np.column_stack([sizes[:, [1, 2]].prod(1), sizes[:, [2, 0]].prod(1), sizes[:, [0, 1]].prod(1)])
-    box, axis = np.divmod(rng.choice(areas.size, 2 * count, p=areas.ravel() / areas.sum()), 3)
-    place = rng.random((2 * count, 3), dtype=np.float32)
-    each = np.arange(2 * count)
-    place[each, axis] = np.rint(place[each, axis])
-    points = corners[box, 0] + place * sizes[box]
-    points[each, axis] += rng.normal(0, _ROUGHNESS, 2 * count)
-    in_door = ((points > _DOOR[0]) & (points < _DOOR[1])).all(axis=1)
-    kept = np.flatnonzero(~in_door)[:count]
-    return points[kept].astype(np.float32), axis[kept], float(np.sqrt(2 * areas.sum() / count))
-
-
-def _colours(means: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return harmonics (N, 16, 3) float32 of waves of colour, as coarse as tiles and as fine as text."""
-    sh = np.zeros((len(means), SH_COEFFICIENTS[-1], 3), np.float32)
-    for wavelength in (1.0, 0.3, 0.08):
-        for channel in range(3):
-            waves = rng.normal(0, 2 * np.pi / wavelength, 3).astype(np.float32)
-            sh[:, 0, channel] += 0.12 / SH_C0 * np.sin(means @ waves)
-    for degree, deviation in enumerate(_HARMONICS, start=1):
-        coefficients = slice(SH_COEFFICIENTS[degree - 1], SH_COEFFICIENTS[degree])
-        shape = sh[:, coefficients].shape
-        sh[:, coefficients] = deviation * rng.standard_normal(shape, dtype=np.float32)
-    return sh
+    return cover_boxes(np.array(_BOXES), np.array([_DOOR]), count, np.random.default_rng(seed))

@@ -9,6 +9,7 @@
     gsfeatloc benchmark scaling --out scaling.png
     gsfeatloc benchmark index --out index.png
     gsfeatloc benchmark twins --share 0,0.02 --photos 200
+    gsfeatloc benchmark building --rooms 2,10,40,100 --folder /tmp
     gsfeatloc benchmark pnp
 
 CPU milliseconds count all threads; on a shared machine they, and ratios within one run, mean more than wall time.
@@ -23,6 +24,7 @@ from pathlib import Path
 from typing import Any
 
 from gsfeatloc_ros.benchmark import index_scaling
+from gsfeatloc_ros.benchmark.building import measure_buildings
 from gsfeatloc_ros.benchmark.frames import measure_map, measure_scene, pinhole, print_frames, view_of_all
 from gsfeatloc_ros.benchmark.measure import machine
 from gsfeatloc_ros.benchmark.pnp import measure_pnp
@@ -151,6 +153,18 @@ def make_parser() -> argparse.ArgumentParser:
     twins.add_argument("--seed", type=int, default=0, help="another one gives other rooms, photos and indices")
     twins.set_defaults(run=_twins)
 
+    building = commands.add_parser("building", parents=[file], help="memory, starts, frames, queries of large maps")
+    building.add_argument(
+        "--rooms",
+        type=lambda text: [number(int, 1)(part) for part in text.split(",")],
+        default=[2, 10, 40, 100],
+        metavar="LIST",
+        help="of the buildings, of 500,000 Gaussians each (default: 2,10,40,100)",
+    )
+    building.add_argument("--folder", type=Path, required=True, help="of the maps; 100 rooms take 7 GB, 13 at first")
+    building.add_argument("--sh-degree", type=int, choices=range(4), default=0, help="(default: %(default)s)")
+    building.set_defaults(run=_building)
+
     commands.add_parser("pnp", help="PoseLib against OpenCV's USAC on simulated matches").set_defaults(
         run=lambda options: measure_pnp()
     )
@@ -242,6 +256,11 @@ def _twins(options: argparse.Namespace) -> None:
         raise ValueError("--photos must be at least 1")
     rows = measure_twins(options.share, options.photos, options.seed)
     print(twins_table(rows))
+    _write(options.json, {"rows": rows})
+
+
+def _building(options: argparse.Namespace) -> None:
+    rows = measure_buildings(options.rooms, options.folder, options.sh_degree)
     _write(options.json, {"rows": rows})
 
 

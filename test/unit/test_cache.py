@@ -27,6 +27,8 @@ from gsfeatloc_ros.render.chunks import LOG2_OPACITY, MEAN_X, PreparedMap
 from gsfeatloc_ros.render.prepare import prepare
 from gsfeatloc_ros.simulate.two_rooms import two_rooms
 
+# Where it begins: behind a line of text, its length and the checksums.
+HEADER = len(cache_file.MAGIC) + 4 * (2 + len(cache_file.ARRAYS))
 ARRAYS = [field.name for field in fields(PreparedMap) if "ndarray" in str(field.type)]
 
 
@@ -169,7 +171,7 @@ def test_cache_that_cannot_be_written_is_no_error(map_file, caplog):
 
 
 def damaged_copies(content: bytes) -> dict[str, bytes]:
-    header = content.index(b"{")
+    header = HEADER
     return {
         "empty": b"",
         "of something else": b"ply\nformat ascii 1.0\n" * 50,
@@ -214,7 +216,7 @@ def forged(map_path: Path, **lies) -> None:
     """Change what the cache's header says of the map, with a checksum that fits."""
     content = cache_of(map_path).read_bytes()
     start = len(cache_file.MAGIC)
-    header = start + 4 * (2 + len(cache_file.ARRAYS))
+    header = HEADER
     end = header + int.from_bytes(content[start : start + 4], "little")
     values = json.loads(content[header:end])
     encoded = json.dumps(values | {"map": values["map"] | lies}).encode()
@@ -253,7 +255,7 @@ def test_shapes_that_the_arrays_cannot_have_are_refused_before_memory_is_taken(m
 
 def cache_origin(map_path: Path) -> dict:
     text = cache_of(map_path).read_bytes().decode("latin-1")
-    return json.JSONDecoder().raw_decode(text, text.index("{"))[0]["origin"]
+    return json.JSONDecoder().raw_decode(text, HEADER)[0]["origin"]
 
 
 @pytest.mark.parametrize(

@@ -51,14 +51,20 @@ UNGUARDED = {
     "cv2.imdecode": ("common/jpeg_png.py", "maps/sog.py", "maps/gsplat_png.py", "evaluate/corruptions.py"),
     ".read_bytes": ("common/kernel_cache.py", "client/faults.py"),
     ".read_text": (
-        *("benchmark/measure.py", "common/memory.py", "client/observer.py", "tools/parameters.py"),
+        *(
+            "benchmark/building.py",
+            "benchmark/measure.py",
+            "common/memory.py",
+            "client/observer.py",
+            "tools/parameters.py",
+        ),
         *("evaluate/report/page.py", "inspect/page.py"),
     ),
     "np.load": ("maps/gsplat_png.py", "client/observer.py", "client/robot.py", "client/flood.py"),
     "torch.load": ("match/weights.py",),
     "json.load": (),
     "json.loads": (
-        *("common/json_file.py", "maps/__init__.py", "maps/sog.py", "render/cache.py", "index/storage.py"),
+        *("common/json_file.py", "maps/__init__.py", "maps/sog.py", "render/cache_file.py", "index/storage.py"),
         *("ros_io/saved_pose.py", "evaluate/record.py"),
     ),
     "yaml.safe_load": ("common/yaml_file.py", "ros_io/parameter_file.py"),
