@@ -55,6 +55,7 @@ UNGUARDED = {
             "benchmark/building.py",
             "benchmark/measure.py",
             "common/memory.py",
+            "common/threads.py",
             "client/observer.py",
             "tools/parameters.py",
         ),
