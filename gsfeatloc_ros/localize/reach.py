@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsfeatloc_ros.common.arrays import to_host
 from gsfeatloc_ros.common.camera import Camera
-from gsfeatloc_ros.common.geometry import transform
 from gsfeatloc_ros.localize.prior import Prior
+from gsfeatloc_ros.pose.lift import LiftOptions, lift
 from gsfeatloc_ros.pose.solve import project_with_jacobians
 from gsfeatloc_ros.render.base import Render
 
@@ -36,15 +35,13 @@ def expected_offset(render: Render, camera: Camera, prior: Prior) -> float:
     Infinite where the map shows nothing.
     """
     across, down = _GRID
-    height, width = render.median_depth.shape
-    columns = ((np.arange(across) + 0.5) * width / across).astype(int)
-    rows = ((np.arange(down) + 0.5) * height / down).astype(int)
+    columns = (np.arange(across) + 0.5) * camera.width / across
+    rows = (np.arange(down) + 0.5) * camera.height / down
     pixels = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
-    depths = to_host(render.median_depth)[pixels[:, 1], pixels[:, 0]].astype(np.float64)
-    seen = np.isfinite(depths)
-    if not seen.any():
+    lifted = lift(render, camera, prior.pose, pixels, LiftOptions())
+    points = lifted.points[lifted.valid]
+    if len(points) == 0:
         return float("inf")
-    points = transform(prior.pose, camera.rays(pixels[seen].astype(np.float64)) * depths[seen, None])
     jacobians = project_with_jacobians(camera, prior.pose, points)
     if jacobians is None:
         return float("inf")

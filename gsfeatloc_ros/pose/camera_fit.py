@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -97,7 +97,9 @@ def _fit(camera: Camera, calibrated: _State, found: Correspondences, options: Po
     # The keypoints' noise is what is left once the camera's errors are explained.
     problem = _Problem.seen_from(free, camera, found, options)
     system = problem.at(free)
-    sigmas = np.sqrt(np.maximum(np.diag(problem.covariance(system, problem.field(system), _ANY_CAMERA))[6:], 0.0))
+    # A camera that is off leaves a smooth field as a bent map does: it must not excuse itself by that.
+    unbent = replace(problem.field(system), smooth=0.0)
+    sigmas = np.sqrt(np.maximum(np.diag(problem.covariance(system, unbent, _ANY_CAMERA))[6:], 0.0))
     excess = np.sqrt(np.maximum(free.camera**2 - sigmas**2, 0.0))
     kept = problem.solve(system, np.clip(np.where(_CONTRADICTED, excess, 0.0), _EXACT, _ANY_CAMERA))
     # What a calibration in use would move the pose by is not known better than that.

@@ -162,10 +162,12 @@ def test_deviation_counts_standard_deviations_of_the_prior() -> None:
     default = np.diag([0.25] * 3 + [0.04] * 3)
     moved = make_pose(so3_exp(np.array([0.0, 0.4, 0.0])), np.array([0.5, 0.0, 0.0]))
     # A hundredth of the default variance is added.
-    assert Prior(np.eye(4), default, default).deviation(moved) == pytest.approx(np.sqrt((1 + 4) / 1.01))
-    assert Prior(np.eye(4), default, default).deviation(np.eye(4)) == 0
+    assert Prior(np.eye(4), default, default, default).deviation(moved) == pytest.approx(np.sqrt((1 + 4) / 1.01))
+    assert Prior(np.eye(4), default, default, default).deviation(np.eye(4)) == 0
     # What a prior claims to know exactly is given a tenth of the default deviation.
-    assert Prior(np.eye(4), np.zeros((6, 6)), default).deviation(moved) == pytest.approx(np.sqrt((1 + 4) / 0.01))
+    assert Prior(np.eye(4), np.zeros((6, 6)), default, default).deviation(moved) == pytest.approx(
+        np.sqrt((1 + 4) / 0.01)
+    )
 
 
 def test_protection_levels_are_along_the_worst_axis() -> None:

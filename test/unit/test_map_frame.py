@@ -144,7 +144,10 @@ def test_a_map_trained_elsewhere_looks_the_same_from_the_robots_frame(make_rende
     elsewhere = replace(trained_elsewhere(here, random_similarity(seed)), antialiased=antialiased)
     pose = make_pose(so3_exp(np.array([0.1, -0.2, 0.05])), np.array([0.3, -0.2, -0.5]))
     a, b = (make_renderer(gaussian_map).render(CAMERA, pose) for gaussian_map in (here, elsewhere))
-    assert -10 * np.log10(np.mean((a.rgb.astype(np.float64) - b.rgb) ** 2)) > 60
+    # But for splats that are at the least alpha that counts: rounding decides on those.
+    difference = np.abs(a.rgb.astype(np.float64) - b.rgb)
+    assert np.quantile(difference, 0.9) < 1e-4
+    assert difference.max() < 0.1
     for name in ("depth", "median_depth", "depth_std"):
         x, y = getattr(a, name), getattr(b, name)
         both = np.isfinite(x) & np.isfinite(y)

@@ -123,7 +123,10 @@ def test_options_of_the_localizer_are_parameters_but_for_those_of_experts():
     assert names - parameters == experts
     assert parameters <= names
     # What the node sets from image to image.
-    searched = {f"search.{item.name}" for item in fields(options.search)} - {"search.skipped", "search.usual_covariance"}
+    searched = {f"search.{item.name}" for item in fields(options.search)} - {
+        "search.skipped",
+        "search.usual_covariance",
+    }
     assert searched <= DEFAULTS.keys()
 
 
