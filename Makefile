@@ -34,7 +34,7 @@ docs: setup
 test: lint build
 	@. scripts/env.sh && tests="python -P -m pytest" && \
 	$$tests -n 2 --dist worksteal test/unit test/gpu test/real && \
-	$$tests -n 3 --dist loadfile test/node --ignore test/node/test_node_stop.py && \
+	$$tests -n 2 --dist loadfile test/node --ignore test/node/test_node_stop.py && \
 	$$tests test/node/test_node_stop.py
 
 # The option named last counts: the one of pyproject.toml comes before it.

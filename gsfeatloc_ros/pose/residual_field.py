@@ -11,11 +11,12 @@ import numpy as np
 _NEIGHBOUR_DISTANCE, _FIELD_DISTANCE = 25.0, 60.0
 # All pairs of at most so many matches are looked at.
 _MAX_PAIRED = 400
-# A smooth field of this variance (square pixels), that is this share of all variance, is more than chance, blur or an
-# unknown shutter leave behind: of right poses in maps that are not bent, 1 in 100 has one (docs/trust.md).
-_MIN_FIELD, _MIN_FIELD_SHARE = 0.025, 0.1
+# A smooth field of this variance, in square pixels, is found in good maps too. What is beyond it the pose has as well.
+_USUAL_FIELD = 0.01
+# A field of this variance, that is this share of all variance, is found in bent maps alone (docs/trust.md).
+_BENT_FIELD, _BENT_SHARE = 0.05, 0.25
 # The pose absorbs most of such a field: its error is of the order of this variance in square pixels, reached where the
-# field is twice the least that counts.
+# field is twice the least of a bent map.
 _BENT_VARIANCE = 30.0
 
 
@@ -61,8 +62,13 @@ class ResidualField:
 
         How much of a bend the pose absorbs cannot be seen, only that what is left is too much.
         """
-        excess = min(self.smooth / _MIN_FIELD, self.smooth / (_MIN_FIELD_SHARE * self.total)) if self.total else 0.0
+        excess = min(self.smooth / _BENT_FIELD, self.smooth / (_BENT_SHARE * self.total)) if self.total else 0.0
         return _BENT_VARIANCE * float(np.clip(excess - 1, 0, 1))
+
+    @property
+    def shared_variance(self) -> float:
+        """Variance, in square pixels along an axis, of what the pose is off by, by the smooth field in all."""
+        return max(self.smooth - _USUAL_FIELD, 0.0) + self.bent_variance
 
 
 def _mean(values: np.ndarray, mask: np.ndarray) -> float:

@@ -278,7 +278,7 @@ def shared_variance(camera: Camera, field: ResidualField, options: PoseOptions) 
     """
     full = 2 * np.maximum(camera.K[:2, 2] + 0.5, [camera.width, camera.height] - (camera.K[:2, 2] + 0.5))
     part = camera.width * camera.height / float(np.prod(full))
-    return options.shared_error**2 / part + options.shared_share * field.near + field.bent_variance
+    return options.shared_error**2 / part + options.shared_share * field.near + field.shared_variance
 
 
 def whiten(
