@@ -86,7 +86,8 @@ def test_from_a_good_prior_no_features_are_needed(localizer, room_camera, room_p
     assert {"features", "match"} <= by_features.milliseconds.keys()
     # What suggested the pose does not matter to it.
     np.testing.assert_allclose(estimate.T_map_camera, by_features.T_map_camera, atol=2e-3)
-    np.testing.assert_allclose(np.diag(estimate.covariance), np.diag(by_features.covariance), rtol=0.2)
+    # What neighbouring residuals have in common differs a little.
+    np.testing.assert_allclose(np.diag(estimate.covariance), np.diag(by_features.covariance), rtol=0.4)
 
 
 def test_a_prior_that_claims_too_much_is_found_out(localizer, room_camera, room_photos) -> None:
