@@ -11,9 +11,8 @@ import numpy as np
 _NEIGHBOUR_DISTANCE, _FIELD_DISTANCE = 25.0, 60.0
 # All pairs of at most so many matches are looked at.
 _MAX_PAIRED = 400
-# A smooth field of this variance, in square pixels, is found in good maps too, and of this share of all variance by
-# chance. What is beyond both the pose has as well.
-_USUAL_FIELD, _CHANCE_SHARE = 0.01, 0.05
+# A smooth field of this variance, in square pixels, is found in good maps too. What is beyond it the pose has as well.
+_USUAL_FIELD = 0.01
 # A field of this variance, that is this share of all variance, is found in bent maps alone (docs/trust.md).
 _BENT_FIELD, _BENT_SHARE = 0.05, 0.25
 # The pose absorbs most of such a field: its error is of the order of this variance in square pixels, reached where the
@@ -69,7 +68,7 @@ class ResidualField:
     @property
     def shared_variance(self) -> float:
         """Variance, in square pixels along an axis, of what the pose is off by, by the smooth field in all."""
-        return max(self.smooth - _USUAL_FIELD - _CHANCE_SHARE * self.total, 0.0) + self.bent_variance
+        return max(self.smooth - _USUAL_FIELD, 0.0) + self.bent_variance
 
 
 def _mean(values: np.ndarray, mask: np.ndarray) -> float:

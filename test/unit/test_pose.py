@@ -232,7 +232,8 @@ def test_jacobians_equal_finite_differences() -> None:
 def test_covariance_of_independent_errors_is_that_of_many_trials(depth_noise: float) -> None:
     """Normalised estimation error squared per degree of freedom is 1 when the covariance is true.
 
-    For Gaussian noise, the narrow loss that real residuals call for errs to safety.
+    For Gaussian noise, the narrow loss that real residuals call for errs to safety, and so does what neighbours have in
+    common by chance.
     """
     nees = []
     for seed in range(150):
@@ -247,7 +248,7 @@ def test_covariance_of_independent_errors_is_that_of_many_trials(depth_noise: fl
         pose, covariance = refine_pose(CAMERA, POSE, lifted, PoseOptions(shared_error=0.0, shared_share=0.0))
         error = np.concatenate([pose[:3, 3] - POSE[:3, 3], so3_log(pose[:3, :3] @ POSE[:3, :3].T)])
         nees.append(error @ np.linalg.solve(covariance, error) / 6)
-    assert 0.5 < np.mean(nees) < 1.2
+    assert 0.4 < np.mean(nees) < 1.2
 
 
 def test_errors_that_matches_share_do_not_average_out() -> None:
