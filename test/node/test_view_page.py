@@ -6,6 +6,7 @@ import re
 import signal
 import subprocess
 import sys
+from functools import partial
 
 import browser as chromium
 import numpy as np
@@ -31,7 +32,9 @@ def page(room_map, tmp_path_factory):
     (folder / "replayed" / "answers.csv").write_text("\n".join([NAMES, ANSWER, FAILURE]))
     command = [sys.executable, "-P", "-m", "gsfeatloc_ros.tools.view", folder / "room.ply", "--port", "0"]
     command += ["--answers", folder / "replayed", "--out", folder / "map.yaml", "--gaussians", "2000"]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    # Who runs tests in the background has them ignore Ctrl-C, and their children inherit that.
+    heed = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, preexec_fn=heed)
     try:
         address = process.stdout.readline().strip()
         assert re.fullmatch(r"http://127\.0\.0\.1:\d+", address)
