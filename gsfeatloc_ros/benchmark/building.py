@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from gsfeatloc_ros.benchmark.frames import UNCOUNTED_FRAMES, pinhole
-from gsfeatloc_ros.benchmark.measure import spread, timed
+from gsfeatloc_ros.benchmark.measure import spread, status_megabytes, timed
 from gsfeatloc_ros.common.geometry import make_pose, rotation_error_deg, so3_exp, translation_error
 from gsfeatloc_ros.localize.engine import load_matcher, load_renderer
 from gsfeatloc_ros.localize.first_run import warm_up
@@ -21,6 +21,7 @@ from gsfeatloc_ros.localize.localizer import Localizer
 from gsfeatloc_ros.localize.settings import MapSettings, MatcherSettings, RendererSettings
 from gsfeatloc_ros.maps.ply import write_ply_parts
 from gsfeatloc_ros.render import Renderer, create_renderer
+from gsfeatloc_ros.render.cache import SUFFIX
 from gsfeatloc_ros.simulate.building import ROOM_GAUSSIANS, Building
 
 _CAMERA = pinhole((640, 480))
@@ -91,7 +92,7 @@ def _in_a_process(part: Callable[..., Any], *arguments: object) -> Any:
 
 
 def _first_start(path: Path) -> dict[str, Any]:
-    path.with_name(path.name + ".gsfeatloc-cache").unlink(missing_ok=True)
+    path.with_name(path.name + SUFFIX).unlink(missing_ok=True)
     return {"first": _start(path)[1]}
 
 
@@ -160,9 +161,8 @@ def _watched() -> Iterator[_Memory]:
 
     def look() -> None:
         while not done.wait(0.01):
-            lines = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
-            memory.anonymous_mb = max(memory.anonymous_mb, int(lines["RssAnon"].split()[0]) / 1024)
-            memory.file_mb = max(memory.file_mb, int(lines["RssFile"].split()[0]) / 1024)
+            memory.anonymous_mb = max(memory.anonymous_mb, status_megabytes("RssAnon"))
+            memory.file_mb = max(memory.file_mb, status_megabytes("RssFile"))
 
     watcher = threading.Thread(target=look, daemon=True)
     watcher.start()

@@ -77,10 +77,10 @@ def memory_taken() -> Iterator[Memory]:
     taken = Memory()
     # Makes the highest value start again from the present one: proc(5).
     Path("/proc/self/clear_refs").write_text("5")
-    before = _status_megabytes("VmRSS")
+    before = status_megabytes("VmRSS")
     yield taken
-    taken.peak = _status_megabytes("VmHWM") - before
-    taken.after = _status_megabytes("VmRSS") - before
+    taken.peak = status_megabytes("VmHWM") - before
+    taken.after = status_megabytes("VmRSS") - before
 
 
 def machine() -> dict[str, str | int]:
@@ -93,6 +93,7 @@ def machine() -> dict[str, str | int]:
     }
 
 
-def _status_megabytes(field: str) -> float:
+def status_megabytes(field: str) -> float:
+    """Return a field of the process's status, as VmRSS, in megabytes (Linux)."""
     lines = Path("/proc/self/status").read_text().splitlines()
     return next(int(line.split()[1]) for line in lines if line.startswith(field + ":")) / 1024

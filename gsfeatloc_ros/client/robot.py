@@ -130,7 +130,7 @@ class WheelOdometry:
 
 
 def run_robot(photos_file: Path, stream: Stream) -> None:
-    """Publish a stream of images, with with what belongs to them, once somebody listens to all topics.
+    """Publish a stream of images, with what belongs to them, once somebody listens to all topics.
 
     For a process of its own: nothing else may delay the camera.
     """

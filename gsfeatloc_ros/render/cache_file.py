@@ -194,9 +194,9 @@ def read(stream: BinaryIO, origin: dict[str, Any], large: int = LARGE_MAP) -> Pr
         raise CacheError("is truncated")
     if zlib.crc32(encoded) != checksums[0]:
         raise CacheError("is damaged")
+    is_large = header.leaves * CHUNK > large
     arrays = {}
     for (name, (dtype, shape)), checksum in zip(layout.items(), checksums[1:], strict=True):
-        is_large = header.leaves * CHUNK > large
         blocks = _blocks(shape, _BLOCK_BYTES // _size(dtype, shape[1:]) if is_large else shape[0])
         found = 0
         for block_shape in blocks:

@@ -40,12 +40,19 @@ class CollectSettings(argparse.Action):
         setattr(namespace, self.dest, getattr(namespace, self.dest) | dict([values]))
 
 
-def node_parameter(text: str) -> tuple[str, Any]:
+def _node_parameter(text: str) -> tuple[str, Any]:
     """Parse NAME:=VALUE of a parameter of the node."""
     try:
         return parse_parameter(text)
     except ValueError as error:
         raise argparse.ArgumentTypeError(str(error)) from error
+
+
+def add_node_parameters(parser: argparse.ArgumentParser, about: str) -> None:
+    """Add -p, which may be given several times, for parameters of the node; `about` is its help."""
+    parser.add_argument(
+        "-p", dest="parameter", type=_node_parameter, action="append", default=[], metavar="NAME:=VALUE", help=about
+    )
 
 
 def localizer_options() -> dict[str, type]:

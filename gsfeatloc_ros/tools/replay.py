@@ -42,9 +42,9 @@ from gsfeatloc_ros.ros_io.settings import Settings
 from gsfeatloc_ros.tools.options import (
     CollectSettings,
     add_map_options,
+    add_node_parameters,
     given_map,
     localizer_options,
-    node_parameter,
     number,
     print_reading,
     setting,
@@ -195,15 +195,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument("--tf", metavar="TOPIC", default="/tf", help="if it is there (default: %(default)s)")
     parser.add_argument("--tf-static", metavar="TOPIC", default="/tf_static", help="the same (default: %(default)s)")
     parser.add_argument("--params-file", type=Path, metavar="FILE", help="parameters of the node")
-    parser.add_argument(
-        "-p",
-        dest="parameter",
-        type=node_parameter,
-        action="append",
-        default=[],
-        metavar="NAME:=VALUE",
-        help="one of these; what is set by an option of its own comes last",
-    )
+    add_node_parameters(parser, "one of these; what is set by an option of its own comes last")
     parser.add_argument(
         "--truth",
         metavar="TOPIC",

@@ -34,7 +34,7 @@ from gsfeatloc_ros.client.observer import Observer
 from gsfeatloc_ros.client.process import isolate_ros, running_localizer
 from gsfeatloc_ros.client.robot import Stream, prepare_room, run_robot
 from gsfeatloc_ros.client.soak_report import add_core_target, add_floods, summarize
-from gsfeatloc_ros.tools.options import node_parameter
+from gsfeatloc_ros.tools.options import add_node_parameters
 from gsfeatloc_ros.tools.status import run_tool
 
 
@@ -114,15 +114,7 @@ def make_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--track", action="store_true", help="odometry in place of priors, and track:=true")
     parser.add_argument("--no-calls", dest="calls", action="store_false", help="do not call the services")
-    parser.add_argument(
-        "-p",
-        dest="parameter",
-        type=node_parameter,
-        action="append",
-        default=[],
-        metavar="NAME:=VALUE",
-        help="of the node",
-    )
+    add_node_parameters(parser, "of the node")
     parser.add_argument("--faults", action="store_true", help="make a fault every two seconds")
     parser.add_argument("--json", type=Path, help="file of the results")
     return parser

@@ -12,7 +12,6 @@ from viser import ViserServer
 from websockets.asyncio.server import ServerConnection
 from websockets.datastructures import Headers
 
-LOOPBACK = "127.0.0.1"
 _OF_THIS_MACHINE = ("127.0.0.1", "localhost", "::1")
 # Of WebSocket (RFC 6455): the other side is not allowed to.
 _POLICY_VIOLATION = 1008

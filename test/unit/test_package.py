@@ -54,7 +54,6 @@ UNGUARDED = {
     ".read_bytes": ("common/kernel_cache.py", "client/faults.py"),
     ".read_text": (
         *(
-            "benchmark/building.py",
             "benchmark/measure.py",
             "common/memory.py",
             "common/threads.py",
