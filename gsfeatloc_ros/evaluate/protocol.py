@@ -10,6 +10,7 @@ import numpy as np
 
 from gsfeatloc_ros.common.geometry import make_pose, random_unit_vector, so3_exp
 from gsfeatloc_ros.evaluate.dataset import Scene
+from gsfeatloc_ros.ros_io.prior import PriorPolicy
 
 # Square root of the 95 % quantile of the chi-square distribution with 3 degrees of freedom: the published bounds below
 # are taken as the radius of the ball that holds 95 % of an isotropic 3D normal distribution.
@@ -129,6 +130,27 @@ def no_prior(scene: Scene, sigma: float, seed: int) -> list[PhotoPrior]:
     return [PhotoPrior(index, 0, pose, given=False) for index, pose in enumerate(_poses_of_others(scene, seed))]
 
 
+def planar(scene: Scene, sigma: float, seed: int) -> list[PhotoPrior]:
+    """Know what the node's `search.planar` knows, height and tilt; x, y and the turn about z are of a random other.
+
+    Height and tilt are off by the standard deviations of that prior, times `sigma`.
+    """
+    plane = PriorPolicy().plane()
+    assert plane.covariance is not None
+    known = sigma * np.sqrt(plane.covariance.diagonal())[[2, 3, 4]]
+    covariance = plane.covariance.copy()
+    covariance[[2, 3, 4], [2, 3, 4]] = np.square(known)
+    priors = []
+    for index, (photo, other) in enumerate(zip(scene.photos, _poses_of_others(scene, seed), strict=True)):
+        rng = np.random.default_rng([seed, index])
+        height, *tilt = known * rng.normal(size=3)
+        turn = rng.uniform(0.0, 2.0 * math.pi)
+        rotation = so3_exp(np.array([0.0, 0.0, turn])) @ so3_exp(np.array([*tilt, 0.0])) @ photo.T_map_camera[:3, :3]
+        position = [*other[:2, 3], photo.T_map_camera[2, 3] + height]
+        priors.append(PhotoPrior(index, 0, make_pose(rotation, position), covariance))
+    return priors
+
+
 def sweep_rotation(scene: Scene, sigma: float, seed: int) -> list[PhotoPrior]:
     """Pan every photo to the right by 0 to `sigma` times the rotation of `paper_bounds`, in ten steps."""
     angles = _steps(sigma * paper_bounds(scene)[0])
@@ -147,10 +169,11 @@ PROTOCOLS: dict[str, Callable[[Scene, float, int], list[PhotoPrior]]] = {
     "near-miss": near_miss,
     "kidnapped": kidnapped,
     "no-prior": no_prior,
+    "planar": planar,
     "sweep-rotation": sweep_rotation,
     "sweep-translation": sweep_translation,
 }
-WITHOUT_PRIOR = ("kidnapped", "no-prior")
+WITHOUT_PRIOR = ("kidnapped", "no-prior", "planar")
 """Those in which no view near the prior shows the photo."""
 SWEEPS = ("sweep-rotation", "sweep-translation")
 

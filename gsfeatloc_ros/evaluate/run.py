@@ -57,7 +57,7 @@ class Run:
         method: "default" (this package's) or "published".
         matcher: one of MATCHERS.
         sigma: scale of the priors' errors.
-        seed: of the priors and of RANSAC.
+        seed: of the priors, of RANSAC and of the places of the index's views.
         max_width: wider photos are resized to this many pixels.
         options: parameters of LocalizerOptions that differ from the default, with their values.
         ablation: the one of ABLATIONS that is taken out, or "".

@@ -179,7 +179,11 @@ def make_parser() -> argparse.ArgumentParser:
         "--sigma", type=_list(number(float, 0)), default=[1.0], metavar="LIST", help="scales of the priors' errors"
     )
     parser.add_argument(
-        "--seed", type=_list(number(int, 0)), default=[0], metavar="LIST", help="seeds of the priors and of RANSAC"
+        "--seed",
+        type=_list(number(int, 0)),
+        default=[0],
+        metavar="LIST",
+        help="seeds of the priors, of RANSAC and of the places of the index's views",
     )
     parser.add_argument(
         "--set",
@@ -221,7 +225,7 @@ def make_parser() -> argparse.ArgumentParser:
         "--index",
         choices=INDICES,
         help="where to look for what the prior does not show: views of the map alone, or of the training poses as well "
-        f"(default: map for {' and '.join(WITHOUT_PRIOR)}, else none)",
+        f"(default: map for {', '.join(WITHOUT_PRIOR)}, else none)",
     )
     parser.add_argument("--limit", type=number(int, 0), default=0, help="only the first photos; 0 for all")
     parser.add_argument(

@@ -180,6 +180,23 @@ def test_sweeps_go_to_the_bound_in_ten_steps(scene, protocol):
         np.testing.assert_allclose(turns, 0, atol=1e-6)
 
 
+def test_a_planar_robot_knows_height_and_tilt_alone(scene):
+    many = replace(scene, photos=scene.photos * 400)
+    priors = PROTOCOLS["planar"](many, 2.0, 0)
+    known = np.sqrt(priors[0].covariance.diagonal())[[2, 3, 4]]
+    true = np.array([many.photos[prior.photo].T_map_camera for prior in priors])
+    poses = np.array([prior.T_map_camera for prior in priors])
+    assert np.std(poses[:, 2, 3] - true[:, 2, 3]) == pytest.approx(known[0], rel=0.1)
+    # Where up is in the camera does not depend on the turn about z.
+    tilt = np.einsum("ij,ikj->ik", poses[:, 2, :3], true[:, :3, :3])
+    np.testing.assert_allclose(np.std(tilt, axis=0)[:2], known[1:], rtol=0.1)
+    turns = poses[:, :3, :3] @ true[:, :3, :3].swapaxes(1, 2)
+    angles = np.arctan2(turns[:, 1, 0], turns[:, 0, 0])
+    np.testing.assert_allclose(np.histogram(angles, bins=4, range=(-np.pi, np.pi))[0], len(priors) / 4, rtol=0.2)
+    assert {*map(tuple, poses[:, :2, 3])} == {tuple(photo.T_map_camera[:2, 3]) for photo in scene.photos}
+    assert (priors[0].covariance.diagonal()[[0, 1, 5]] > 1e5).all()
+
+
 @given(seed=st.integers(0, 2**32 - 1), sigma=st.floats(0, 3))
 @pytest.mark.parametrize("protocol", PROTOCOLS)
 def test_protocols_give_poses(scene_of_one, protocol, seed, sigma):

@@ -6,6 +6,7 @@ import json
 import re
 import shutil
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 
 import joblib
@@ -25,6 +26,8 @@ from gsfeatloc_ros.evaluate.run import Run, draw_priors
 from gsfeatloc_ros.evaluate.scene import load_scene
 from gsfeatloc_ros.evaluate.suites import SUITES
 from gsfeatloc_ros.evaluate.tables import Group
+from gsfeatloc_ros.index import IndexOptions
+from gsfeatloc_ros.index.storage import SUFFIX, load_index
 from gsfeatloc_ros.localize.options import LocalizerOptions
 from gsfeatloc_ros.maps import load_map
 from gsfeatloc_ros.maps.ply import write_ply
@@ -87,6 +90,15 @@ def test_several_of_everything_in_one_call(room_scene, tmp_path, capsys):
     assert len(table) == 5
     assert table[0].split()[:3] == ["scene", "protocol", "sigma"]
     assert all(line.startswith("room") for line in table[1:])
+
+
+@pytest.mark.slow
+def test_each_seed_has_an_index_of_its_own(room_scene, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr("gsfeatloc_ros.evaluate.run.IndexOptions", partial(IndexOptions, views=8))
+    assert main([str(room_scene), "--protocol", "no-prior,planar", "--seed", "0,1", "--limit", "1"]) == 0
+    one, other = (load_index(path).poses for path in tmp_path.rglob(f"*{SUFFIX}"))
+    assert not np.array_equal(one, other)
 
 
 @pytest.mark.slow
