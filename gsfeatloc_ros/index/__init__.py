@@ -2,6 +2,6 @@
 
 from gsfeatloc_ros.index.build import build_index
 from gsfeatloc_ros.index.options import IndexOptions
-from gsfeatloc_ros.index.view_index import ViewIndex
+from gsfeatloc_ros.index.view_index import Nearest, ViewIndex
 
-__all__ = ["IndexOptions", "ViewIndex", "build_index"]
+__all__ = ["IndexOptions", "Nearest", "ViewIndex", "build_index"]

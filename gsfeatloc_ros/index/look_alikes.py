@@ -8,13 +8,12 @@ import numpy as np
 
 from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.geometry import invert, transform
-from gsfeatloc_ros.index.view_index import ViewIndex
+from gsfeatloc_ros.index.view_index import Nearest, ViewIndex
 from gsfeatloc_ros.match.base import Features
 from gsfeatloc_ros.pose.solve import Correspondences, ransac_pose, reprojection_errors
 
-# Of so many features of the index that are nearest to one of a picture, those look like it whose distance is less than
-# this share of that of the farthest.
-_NEIGHBOURS = 32
+# Of the landmarks that are nearest to a feature of a picture, those look like it whose distance is less than this share
+# of that of the farthest.
 _ALIKE = 0.75
 # Of a picture 320 wide, what is seen within so many pixels of a feature is what a pose explains it by; so much agrees
 # with a pose.
@@ -32,19 +31,18 @@ _MAX_MOTIONS = 4
 _SAME_MOTION = 0.1
 
 
-def poses_elsewhere(index: ViewIndex, camera: Camera, features: Features, found: np.ndarray) -> Iterator[np.ndarray]:
+def poses_elsewhere(index: ViewIndex, camera: Camera, nearest: Nearest, found: np.ndarray) -> Iterator[np.ndarray]:
     """Yield up to three poses (4, 4), at which the index holds what looks like a picture, the likeliest first.
 
     Args:
         index: to look in.
         camera: of the picture, without distortion, about 320 pixels wide.
-        features: of the picture, on the host.
+        nearest: what of the index looks like the picture's features.
         found: pose (4, 4) of the picture; what it explains is left out.
     """
-    distances, points = index.nearest(features, _NEIGHBOURS)
-    feature, neighbour = np.nonzero(distances < _ALIKE**2 * distances[:, -1:])
-    alike = points[feature, neighbour]
-    left = Correspondences(np.asarray(features.keypoints, np.float64)[feature], alike, np.zeros_like(alike))
+    feature, neighbour = np.nonzero(nearest.distances < _ALIKE**2 * nearest.distances[:, -1:])
+    alike = index.points_of(nearest.landmarks[feature, neighbour])
+    left = Correspondences(nearest.pixels[feature].astype(np.float64), alike, np.zeros_like(alike))
     explained = reprojection_errors(camera, found, left) <= _EXPLAINED
     least = max(_MIN_FEATURES, _MIN_SHARE * _distinct(left.select(explained)))
     for _ in range(_MAX_PLACES):
@@ -73,7 +71,7 @@ def find_look_alikes(index: ViewIndex, camera: Camera) -> np.ndarray:
         pixels = camera.project(transform(invert(pose), points)).astype(np.float32)
         features = Features(pixels, descriptors, np.ones(len(pixels), np.float32))
         distance = np.median(np.linalg.norm(points - pose[:3, 3], axis=1))
-        for elsewhere in poses_elsewhere(index, camera, features, pose):
+        for elsewhere in poses_elsewhere(index, camera, index.nearest(features), pose):
             motion = elsewhere @ invert(pose)
             carried = transform(motion, points)
             gaps = [np.median(np.linalg.norm(transform(known, points) - carried, axis=1)) for known in motions]

@@ -20,7 +20,8 @@ _VALUES = 256
 # Lists that descriptors are kept in, about the square root of their number, and how many of them are searched.
 _MAX_LISTS = 4096
 _SEARCHED_LISTS = 12
-# A feature votes for the views of this many of its nearest.
+# So many are found that are nearest to a feature; it votes for the views of the first of them.
+_NEIGHBOURS = 32
 _VOTES = 8
 # Lowe's ratio in the matching with a view's few features.
 _MAX_DISTANCE_RATIO = 0.9
@@ -28,6 +29,21 @@ _MAX_DISTANCE_RATIO = 0.9
 _BATCH = 100_000
 # Steps of a point's coordinate over the box of all points.
 _STEPS = 65535
+
+
+@dataclass(frozen=True, eq=False)
+class Nearest:
+    """The landmarks of an index that look most like each of the features of a picture, the nearest first.
+
+    Attributes:
+        pixels: (n, 2) of the features.
+        distances: (n, k) float32, squared, of the descriptors; infinite where no more are near enough to be looked at.
+        landmarks: (n, k) int64, their numbers; -1 there.
+    """
+
+    pixels: np.ndarray
+    distances: np.ndarray
+    landmarks: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,28 +74,23 @@ class ViewIndex:
     def __len__(self) -> int:
         return len(self.poses)
 
-    def rank(self, features: Features) -> np.ndarray:
+    def nearest(self, features: Features) -> Nearest:
+        """Find what looks most like the features of a picture in all views: 32 landmarks, or as many as there are."""
+        distances, numbers = self._search.search(features.descriptors, min(_NEIGHBOURS, len(self.codes)))
+        return Nearest(features.keypoints, np.where(numbers >= 0, distances, np.inf), numbers)
+
+    def rank(self, nearest: Nearest) -> np.ndarray:
         """Return the number of features of a photo (N,) float64 that speak for each view.
 
-        A feature has a vote for each view that shows one of the landmarks nearest to it.
+        A feature has a vote for each view that shows one of the eight landmarks nearest to it.
         """
-        if len(self.codes) == 0 or len(features) == 0:
-            return np.zeros(len(self))
-        _, nearest = self._search.search(features.descriptors, min(_VOTES, len(self.codes)))
-        feature, rank = np.nonzero(nearest >= 0)
-        like = csr_array((np.ones(len(feature)), (feature, nearest[feature, rank])), (len(features), len(self.codes)))
+        landmarks = nearest.landmarks[:, :_VOTES]
+        feature, rank = np.nonzero(landmarks >= 0)
+        like = csr_array(
+            (np.ones(len(feature)), (feature, landmarks[feature, rank])), (len(landmarks), len(self.codes))
+        )
         # One vote a view, of how many of its landmarks ever: repetitive texture must not outvote the rest.
         return np.asarray(((like @ self._shown) > 0).sum(axis=0), np.float64)
-
-    def nearest(self, features: Features, count: int) -> tuple[np.ndarray, np.ndarray]:
-        """Find what is nearest to features of a photo in all views; `count` of each, or as many as there are.
-
-        Returns:
-            Squared distances (n, count) float32 of the descriptors, the nearest first, infinite where there are no more
-            near enough to be looked at; and the points (n, count, 3) of the map.
-        """
-        distances, numbers = self._search.search(features.descriptors, min(count, len(self.codes)))
-        return np.where(numbers >= 0, distances, np.inf), self._points(numbers)
 
     def match(self, features: Features, view: int) -> tuple[Matches, np.ndarray]:
         """Match a photo's features with a view's; return the matches, and the points (M, 3) of the map at them.
@@ -95,14 +106,18 @@ class ViewIndex:
     def contents(self, view: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the descriptors (m, D) float32 of the landmarks that a view shows, and their points (m, 3)."""
         shown = self._landmarks(view)
-        return self._decoded(self.codes[shown]), self._points(shown)
+        return self._decoded(self.codes[shown]), self.points_of(shown)
+
+    def points_of(self, landmarks: np.ndarray) -> np.ndarray:
+        """Return the points (..., 3), map frame, of landmarks by their numbers (...)."""
+        return self.low + self.points[landmarks] / _STEPS * (self.high - self.low)
 
     @cached_property
     def centres(self) -> np.ndarray:
         """What the views look at: the medians (N, 3) of their points, map frame; of a view without any its place."""
         return np.array(
             [
-                np.median(self._points(self._landmarks(view)), axis=0) if self.counts[view] else pose[:3, 3]
+                np.median(self.points_of(self._landmarks(view)), axis=0) if self.counts[view] else pose[:3, 3]
                 for view, pose in enumerate(self.poses)
             ]
         ).reshape(-1, 3)
@@ -155,10 +170,6 @@ class ViewIndex:
     def _landmarks(self, view: int) -> np.ndarray:
         """Return the numbers (m,) of the landmarks that a view shows."""
         return self.seen[self._first[view] : self._first[view + 1]]
-
-    def _points(self, numbers: np.ndarray) -> np.ndarray:
-        """Return the points (..., 3), map frame, of landmarks by their numbers."""
-        return self.low + self.points[numbers] / _STEPS * (self.high - self.low)
 
     def _decoded(self, codes: np.ndarray) -> np.ndarray:
         """Return the descriptors (m, D) float32 of codes (m, CODE_BYTES), of unit length."""

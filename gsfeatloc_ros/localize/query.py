@@ -14,10 +14,10 @@ from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.geometry import invert, transform
 from gsfeatloc_ros.common.photo import Photo
 from gsfeatloc_ros.common.stage_clock import StageClock
-from gsfeatloc_ros.index import ViewIndex
+from gsfeatloc_ros.index import Nearest, ViewIndex
 from gsfeatloc_ros.localize.blur import Blur
 from gsfeatloc_ros.localize.options import LocalizerOptions
-from gsfeatloc_ros.match.base import Matcher, Matches, Tracker
+from gsfeatloc_ros.match.base import Features, Matcher, Matches, Tracker
 from gsfeatloc_ros.pose.lift import Lifted, lift
 from gsfeatloc_ros.pose.readout import at_middle_row
 from gsfeatloc_ros.pose.solve import Correspondences, PoseSolution, solve_near, solve_pose
@@ -123,6 +123,15 @@ class Query:
         """The photo's features, as the matcher gives them."""
         with self.clock.stage("features"):
             return self.components.matcher.features(self.photo.image)
+
+    @cached_property
+    def nearest(self) -> Nearest:
+        """What of the index looks like the photo's features; there is an index, and these have descriptors."""
+        index, features = self.components.index, self.features
+        assert index is not None
+        assert isinstance(features, Features)
+        with self.clock.stage("search"):
+            return index.nearest(features.on_host())
 
     @cached_property
     def tracker(self) -> Tracker:

@@ -38,32 +38,32 @@ class Hint:
     weight: float
 
 
-def retrieve(
-    small: Query, index: ViewIndex, likely: Callable[[np.ndarray], bool], skipped: int = 0
-) -> Iterator[Hint | None]:
-    """Yield what each view of an index suggests, the view that most speaks for first; None where it is nothing.
+def retrieve(small: Query, likely: Callable[[np.ndarray], bool], skipped: int = 0) -> Iterator[Hint | None]:
+    """Yield what each view of the index suggests, the view that most speaks for first; None where it is nothing.
 
     Args:
-        small: the photo, at most SEARCH_WIDTH wide. It is looked for upside down and on its sides too, where its
-            features are told only the same way up: nobody says which way is up in the map.
-        index: to look in, of the features of the photo's matcher.
+        small: the photo, at most SEARCH_WIDTH wide, and the index. It is looked for upside down and on its sides too,
+            where its features are told only the same way up: nobody says which way is up in the map.
         likely: whether a prior holds a pose (4, 4) for possible; it ranks the views and forbids none.
         skipped: so many of the first views are left out.
     """
-    features = small.features
+    index, features = small.components.index, small.features
+    assert index is not None
     if not isinstance(features, Features):
         return
 
     def weight(pose: np.ndarray) -> float:
         return 1.0 if likely(pose) else 1.0 / _WEIGHT_OF_PRIOR
 
-    turned = [features.on_host()]
+    turned, nearest = [features.on_host()], [small.nearest]
     for turns in (1, 2, 3) if small.components.matcher.upright else ():
         with small.clock.stage("features"):
             turned.append(_turned(small, turns))
+        with small.clock.stage("search"):
+            nearest.append(index.nearest(turned[-1]))
     with small.clock.stage("search"):
         weights = np.array([weight(pose) for pose in index.poses])
-        votes = np.array([index.rank(found) * weights for found in turned])
+        votes = np.array([index.rank(found) * weights for found in nearest])
         groups = [_Group(small, index, *pair) for pair in zip(turned, np.argsort(-votes, kind="stable"), strict=True)]
     for number in np.argsort(-votes, axis=None, kind="stable")[skipped:].tolist():
         turns, view = divmod(number, len(index))

@@ -128,9 +128,10 @@ class Search:
         if self.searched == 0:
             # It was found at the prior, and stands by it, unless the prior holds others for possible too.
             elsewhere = [pose for pose in elsewhere if self._likely(pose)]
-        elif isinstance(features := self._small.features, Features):
+        elif isinstance(self._small.features, Features):
+            nearest = self._small.nearest
             with self._small.clock.stage("search"):
-                elsewhere += poses_elsewhere(index, camera, features.on_host(), place.pose)
+                elsewhere += poses_elsewhere(index, camera, nearest, place.pose)
 
         def is_known(pose: np.ndarray) -> bool:
             return any(known.offset(camera, pose) < _MIN_DISTANCE_OF_RIVALS for known in places)
@@ -173,10 +174,9 @@ class Search:
 
     def _indexed(self) -> Iterator[np.ndarray]:
         """Compare the photo with the index's views and yield the poses that the best of them suggest."""
-        index, options = self._small.components.index, self._small.components.options.search
-        assert index is not None
+        options = self._small.components.options.search
         end = self._now() + options.max_seconds
-        hints = islice(retrieve(self._small, index, self._likely, options.skipped), options.max_views)
+        hints = islice(retrieve(self._small, self._likely, options.skipped), options.max_views)
         while self._compare(islice(hints, _BATCH)) and self._now() < end:
             yield from self._follow(_MAX_FOLLOWED_VIEWS, MIN_HINT)
         yield from self._follow(_MAX_FOLLOWED_HINTS, _MIN_INDEX_HINT)

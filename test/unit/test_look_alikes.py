@@ -68,12 +68,12 @@ def test_a_picture_is_found_at_the_copy_and_nowhere_else() -> None:
     poses, descriptors, points = made_up_place(0)
     pixels = CAMERA.project((points[1] - poses[1][:3, 3]) @ poses[1][:3, :3]).astype(np.float32)
     features = Features(pixels, photo_of(descriptors[1], noise=0.1).descriptors, np.ones(len(pixels), np.float32))
-    (elsewhere,) = poses_elsewhere(index, CAMERA, features, poses[1])
+    (elsewhere,) = poses_elsewhere(index, CAMERA, index.nearest(features), poses[1])
     assert are_near(elsewhere, motion @ poses[1])
-    (back,) = poses_elsewhere(index, CAMERA, features, motion @ poses[1])
+    (back,) = poses_elsewhere(index, CAMERA, index.nearest(features), motion @ poses[1])
     assert are_near(back, poses[1])
 
 
 def test_nothing_is_like_a_picture_of_nothing() -> None:
     index = twins(make_pose(np.eye(3), np.array([20.0, 0, 0])))
-    assert list(poses_elsewhere(index, CAMERA, Features.none(128), np.eye(4))) == []
+    assert list(poses_elsewhere(index, CAMERA, index.nearest(Features.none(128)), np.eye(4))) == []
