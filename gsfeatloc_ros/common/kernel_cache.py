@@ -1,4 +1,4 @@
-"""Where numba keeps compiled kernels (render/kernels.py). This imports nothing of numba."""
+"""Where numba keeps compiled kernels (common/kernels.py). This imports nothing of numba."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def set_kernel_cache() -> None:
     $XDG_CACHE_HOME/gsfeatloc_ros/numba or ~/.cache/gsfeatloc_ros/numba. It is this user's alone. NUMBA_CACHE_DIR is it
     from then on, also in the processes that this one starts.
     """
-    name = f"kernels-{hash_of_sources('render')[:16]}"
+    name = f"kernels-{hash_of_sources('pose', 'render')[:16]}"
     chosen = os.environ.get("NUMBA_CACHE_DIR")
     # Processes inherit it from those that start them.
     roots = [Path(chosen).parent if Path(chosen).name == name else Path(chosen)] if chosen else _usual_roots()

@@ -7,7 +7,7 @@ import numpy as np
 from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.localize.prior import Prior
 from gsfeatloc_ros.pose.lift import LiftOptions, lift
-from gsfeatloc_ros.pose.solve import project_with_jacobians
+from gsfeatloc_ros.pose.linear import POSE_PARAMETERS, linearize
 from gsfeatloc_ros.render.base import Render
 
 # Optical flow finds the photo where it is off by at most this share of its width: of 857 photos of bonsai, lego and
@@ -42,9 +42,9 @@ def expected_offset(render: Render, camera: Camera, prior: Prior) -> float:
     points = lifted.points[lifted.valid]
     if len(points) == 0:
         return float("inf")
-    jacobians = project_with_jacobians(camera, prior.pose, points)
-    if jacobians is None:
+    linear = linearize(camera, prior.pose, points)
+    if linear is None:
         return float("inf")
-    _, by_pose, _ = jacobians
+    by_pose = linear.by_state[:, :, :POSE_PARAMETERS]
     variances = np.einsum("mij,jk,mik->m", by_pose, prior.usual_covariance, by_pose)
     return float(np.median(np.sqrt(np.maximum(variances, 0.0))))

@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gsfeatloc_ros.common.camera import Camera
-from gsfeatloc_ros.common.geometry import moved, skew
+from gsfeatloc_ros.common.geometry import moved
+from gsfeatloc_ros.pose.linear import CAMERA_PARAMETERS, POSE_PARAMETERS, linearize, normal_equations
 from gsfeatloc_ros.pose.residual_field import ResidualField
 from gsfeatloc_ros.pose.solve import Correspondences, PoseOptions, shared_variance, whiten
 
-# Parameters beside the pose: focal length (relative), k1, and by how much the camera turns, in radians about its axes,
-# while the shutter runs from the first row to the last. Each is zero by the calibration, with a standard deviation.
+# Standard deviations of the camera's parameters (pose/linear.py), each of which is zero by the calibration.
 # To see whether the calibration is of this camera at all: so wide that what photos do not show stays near zero.
 _ANY_CAMERA = np.array([0.05, 0.1, 0.03, 0.03, 0.03])
 # How far a calibration in use is off: what the covariance allows for.
@@ -57,8 +57,8 @@ class CameraFit:
     def reprojection_errors(self, camera: Camera, found: Correspondences) -> np.ndarray:
         """Return the distances (M,) in pixels between pixels and points seen by this camera; inf behind it."""
         errors = np.full(len(found.pixels), np.inf)
-        ahead = _in_camera(camera, self.T_map_camera, self.followed, found)[:, 2] > np.finfo(np.float32).tiny
-        residuals, _ = _linearize(camera, self.T_map_camera, self.followed, found.select(ahead))
+        ahead = np.flatnonzero(_depths(camera, self.T_map_camera, self.followed, found) > np.finfo(np.float32).tiny)
+        residuals, _ = _linearize(camera, _State(self.T_map_camera, self.followed), found.select(ahead))
         errors[ahead] = np.linalg.norm(residuals, axis=1)
         return errors
 
@@ -83,7 +83,7 @@ def fit_camera(
         The fit; None where the matches do not determine it.
     """
     try:
-        fit = _fit(camera, _State(T_map_camera, np.zeros(len(_ANY_CAMERA))), found, options)
+        fit = _fit(camera, _State(T_map_camera, np.zeros(CAMERA_PARAMETERS)), found, options)
     except (np.linalg.LinAlgError, _BehindCameraError):
         return None
     covariance = fit.covariance
@@ -145,15 +145,15 @@ class _System:
     state: _State
     residuals: np.ndarray
     jacobian: np.ndarray
-    squared: np.ndarray
-    weights: np.ndarray
     hessian: np.ndarray
     gradient: np.ndarray
+    squared: np.ndarray
+    weights: np.ndarray
 
     def step(self, deviations: np.ndarray) -> np.ndarray:
         """Return the step (11,) to the most likely state of the linearized problem."""
         information = _information(deviations)
-        known = information * np.concatenate([np.zeros(6), self.state.camera])
+        known = information * np.concatenate([np.zeros(POSE_PARAMETERS), self.state.camera])
         return -np.linalg.solve(self.hessian + np.diag(information), self.gradient + known)
 
 
@@ -169,7 +169,7 @@ class _Problem:
     @classmethod
     def seen_from(cls, state: _State, camera: Camera, found: Correspondences, options: PoseOptions) -> _Problem:
         """Return the problem with the keypoints' noise as measured at a state."""
-        residuals, _ = _linearize(camera, state.pose, state.camera, found)
+        residuals, _ = _linearize(camera, state, found)
         whitening = whiten(camera, state.pose, found, residuals)
         if whitening is None:
             raise _BehindCameraError
@@ -201,60 +201,28 @@ class _Problem:
 
     def at(self, state: _State) -> _System:
         """Return the whitened problem at a state with Cauchy's weights (iteratively reweighted least squares)."""
-        residuals, jacobian = _linearize(self.calibrated, state.pose, state.camera, self.found)
-        white = np.einsum("mij,mj->mi", self.whitening, residuals)
-        white_jacobian = self.whitening @ jacobian
-        squared = (white**2).sum(axis=1)
-        weights = 1.0 / (1.0 + squared / self.options.cauchy_scale**2)
-        size = jacobian.shape[2]
-        weighted = (weights[:, None, None] * white_jacobian).reshape(-1, size)
-        hessian = weighted.T @ white_jacobian.reshape(-1, size)
-        return _System(state, residuals, jacobian, squared, weights, hessian, weighted.T @ white.ravel())
+        residuals, jacobian = _linearize(self.calibrated, state, self.found)
+        scale = self.options.cauchy_scale
+        return _System(
+            state, residuals, jacobian, *normal_equations(self.whitening, residuals, jacobian, jacobian.shape[2], scale)
+        )
 
 
 def _information(deviations: np.ndarray) -> np.ndarray:
     """Return what is known (11,) of pose and camera before the photo is seen."""
-    return np.concatenate([np.zeros(6), 1.0 / deviations**2])
+    return np.concatenate([np.zeros(POSE_PARAMETERS), 1.0 / deviations**2])
 
 
-def _when(camera: Camera, found: Correspondences) -> np.ndarray:
-    """Return when (M, 1) the pixels' rows are read, from -0.5 for the first row to 0.5 for the last."""
-    return ((found.pixels[:, 1] + 0.5) / camera.height - 0.5)[:, None]
-
-
-def _in_camera(camera: Camera, pose: np.ndarray, extra: np.ndarray, found: Correspondences) -> np.ndarray:
-    """Return the points (M, 3) in the camera frame as their rows are read: it has turned by then, by small angles."""
+def _depths(camera: Camera, pose: np.ndarray, deviation: np.ndarray, found: Correspondences) -> np.ndarray:
+    """Return the depths (M,) of the points as their rows are read: the camera has turned by then, by small angles."""
     in_camera = (found.points - pose[:3, 3]) @ pose[:3, :3]
-    return in_camera - _when(camera, found) * (in_camera @ skew(extra[2:]).T)
+    when = (found.pixels[:, 1] + 0.5) / camera.height - 0.5
+    return in_camera[:, 2] - when * np.cross(deviation[2:], in_camera)[:, 2]
 
 
-def _linearize(
-    camera: Camera, pose: np.ndarray, extra: np.ndarray, found: Correspondences
-) -> tuple[np.ndarray, np.ndarray]:
+def _linearize(camera: Camera, state: _State, found: Correspondences) -> tuple[np.ndarray, np.ndarray]:
     """Return residuals (M, 2) and their Jacobians (M, 2, 11) by pose and camera; raise _BehindCameraError."""
-    offsets = found.points - pose[:3, 3]
-    in_camera = _in_camera(camera, pose, extra, found)
-    z = in_camera[:, 2:]
-    if not (z > 0).all():
+    linear = linearize(camera, state.pose, found.points, state.camera, found.pixels[:, 1])
+    if linear is None:
         raise _BehindCameraError
-    slopes = in_camera[:, :2] / z
-    radius2 = (slopes**2).sum(axis=1, keepdims=True)
-    focal = np.array([camera.K[0, 0], camera.K[1, 1]])
-    bent = 1 + extra[1] * radius2
-    projected = (1 + extra[0]) * focal * slopes * bent + camera.K[:2, 2]
-    by_point_in_camera = np.zeros((len(found.pixels), 2, 3))
-    by_point_in_camera[:, 0, 0], by_point_in_camera[:, 1, 1] = (1 + extra[0]) * focal
-    by_point_in_camera[:, :, 2] = -(1 + extra[0]) * focal * slopes
-    by_point_in_camera /= z[..., None]
-    by_point = by_point_in_camera @ pose[:3, :3].T
-    jacobian = np.concatenate(
-        [
-            -by_point,
-            by_point @ skew(offsets),
-            (focal * slopes * bent)[..., None],
-            ((1 + extra[0]) * focal * slopes * radius2)[..., None],
-            by_point_in_camera @ skew(in_camera) * _when(camera, found)[..., None],
-        ],
-        axis=2,
-    )
-    return projected - found.pixels, jacobian
+    return linear.projected - found.pixels, linear.by_state

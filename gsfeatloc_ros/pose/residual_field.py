@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gsfeatloc_ros.common.kernels import njit
+
 # Matches nearer to each other than the first, in pixels, are neighbours: they share the blur, the splat, the edge.
 # What those between the two have in common is a field that is smooth over the photo.
 _NEIGHBOUR_DISTANCE, _FIELD_DISTANCE = 25.0, 60.0
@@ -44,17 +46,9 @@ class ResidualField:
         """
         step = 1 + len(pixels) // _MAX_PAIRED
         pixels, residuals = pixels[::step], residuals[::step]
-        squares = (pixels**2).sum(axis=1)
-        distances = squares[:, None] + squares - 2 * pixels @ pixels.T
-        products = 0.5 * residuals @ residuals.T
-        lengths = 2 * np.diag(products)
-        agrees = lengths <= max_error**2
-        near = distances < _NEIGHBOUR_DISTANCE**2
-        apart = ~near & (distances < _FIELD_DISTANCE**2) & agrees & agrees[:, None]
-        np.fill_diagonal(near, False)
-        return ResidualField(
-            _mean(products, near), _mean(products, apart), 0.5 * float(lengths[agrees].mean()) if agrees.any() else 0.0
-        )
+        agrees = (residuals**2).sum(axis=1) <= max_error**2
+        total = 0.5 * float((residuals[agrees] ** 2).sum(axis=1).mean()) if agrees.any() else 0.0
+        return ResidualField(*_means(pixels, residuals, agrees), total)
 
     @property
     def bent_variance(self) -> float:
@@ -71,7 +65,21 @@ class ResidualField:
         return max(self.smooth - _USUAL_FIELD, 0.0) + self.bent_variance
 
 
-def _mean(values: np.ndarray, mask: np.ndarray) -> float:
-    """Return the mean of the values (M, M) that a mask names, 0 for none and where it is negative."""
-    count = mask.sum()
-    return max(float((values * mask).sum()) / count, 0.0) if count else 0.0
+@njit(cache=True, nogil=True)
+def _means(pixels, residuals, agrees):
+    """Return half the mean product of residuals of neighbours, and of those farther apart; 0 where it is negative."""
+    near = apart = 0.0
+    near_pairs = apart_pairs = 0
+    for a in range(len(pixels)):
+        for b in range(a):
+            distance = (pixels[a, 0] - pixels[b, 0]) ** 2 + (pixels[a, 1] - pixels[b, 1]) ** 2
+            if distance >= _FIELD_DISTANCE**2:
+                continue
+            product = 0.5 * (residuals[a, 0] * residuals[b, 0] + residuals[a, 1] * residuals[b, 1])
+            if distance < _NEIGHBOUR_DISTANCE**2:
+                near += product
+                near_pairs += 1
+            elif agrees[a] and agrees[b]:
+                apart += product
+                apart_pairs += 1
+    return max(near / max(near_pairs, 1), 0.0), max(apart / max(apart_pairs, 1), 0.0)

@@ -7,14 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 import poselib
 
 from gsfeatloc_ros.common.camera import Camera
-from gsfeatloc_ros.common.geometry import invert, make_pose, moved, skew
+from gsfeatloc_ros.common.geometry import invert, make_pose, moved
 from gsfeatloc_ros.common.parameter import parameter
+from gsfeatloc_ros.pose.linear import POSE_PARAMETERS, Linear, NormalEquations, linearize, normal_equations
 from gsfeatloc_ros.pose.residual_field import ResidualField
 
 _MIN_ITERATIONS, _MAX_ITERATIONS = 200, 10_000
@@ -224,45 +224,49 @@ def refine_pose(
     """
     pose = T_map_camera
     damping = 1e-4
-    linear = _linearize(camera, pose, found)
+    linear = linearize(camera, pose, found.points)
     if linear is None:
         return None
-    whitening = _whitening(linear.residuals, _apply(linear.by_point, found.sigmas))
+    whitening = _whitening(linear.projected - found.pixels, _apply(linear.by_point, found.sigmas))
 
-    def cost(residuals: np.ndarray) -> float:
-        return float(np.log1p((_apply(whitening, residuals) ** 2).sum(axis=1) / options.cauchy_scale**2).sum())
+    def equations_of(linear: Linear) -> NormalEquations:
+        residuals = linear.projected - found.pixels
+        return normal_equations(whitening, residuals, linear.by_state, POSE_PARAMETERS, options.cauchy_scale)
 
-    current = cost(linear.residuals)
+    def cost(equations: NormalEquations) -> float:
+        return float(np.log1p(equations.squared / options.cauchy_scale**2).sum())
+
+    equations = equations_of(linear)
+    current = cost(equations)
     for _ in range(_REFINE_ITERATIONS):
-        hessian, gradient = _normal_equations(whitening, linear, options.cauchy_scale)
+        hessian = equations.hessian
         try:
-            step = np.linalg.solve(hessian + damping * np.diag(np.diag(hessian)), -gradient)
+            step = np.linalg.solve(hessian + damping * np.diag(np.diag(hessian)), -equations.gradient)
         except np.linalg.LinAlgError:
             return None
         candidate = moved(pose, step)
-        linear_there = _linearize(camera, candidate, found)
-        if linear_there is None or (cost_there := cost(linear_there.residuals)) > current:
+        linear_there = linearize(camera, candidate, found.points)
+        equations_there = equations_of(linear_there) if linear_there else None
+        if linear_there is None or equations_there is None or (cost_there := cost(equations_there)) > current:
             damping *= 10
             continue
         converged = current - cost_there <= _CONVERGED * current
-        pose, current, damping, linear = candidate, cost_there, damping / 10, linear_there
+        pose, current, damping, linear, equations = candidate, cost_there, damping / 10, linear_there, equations_there
         if converged:
             break
 
-    hessian, _ = _normal_equations(whitening, linear, options.cauchy_scale)
     try:
-        covariance = np.linalg.inv(hessian)
+        covariance = np.linalg.inv(equations.hessian)
     except np.linalg.LinAlgError:
         return None
     if not (np.isfinite(covariance).all() and np.linalg.eigvalsh(covariance)[0] > 0):
         return None
-    squared = (_apply(whitening, linear.residuals) ** 2).sum(axis=1)
-    weights = _cauchy_weights(squared, options.cauchy_scale)
-    degrees_of_freedom = max(2 * weights.sum() - 6, 1.0)
-    inflation = max((weights * squared).sum() / degrees_of_freedom, 1.0)
-    weighted = (weights[:, None, None] * linear.by_pose).reshape(-1, 6)
-    information_of_a_match = weighted.T @ linear.by_pose.reshape(-1, 6) / weights.sum()
-    field = ResidualField.of(found.pixels, linear.residuals, options.max_reprojection_error)
+    weights, by_pose = equations.weights, linear.by_state[:, :, :POSE_PARAMETERS]
+    degrees_of_freedom = max(2 * weights.sum() - POSE_PARAMETERS, 1.0)
+    inflation = max((weights * equations.squared).sum() / degrees_of_freedom, 1.0)
+    weighted = (weights[:, None, None] * by_pose).reshape(-1, POSE_PARAMETERS)
+    information_of_a_match = weighted.T @ by_pose.reshape(-1, POSE_PARAMETERS) / weights.sum()
+    field = ResidualField.of(found.pixels, linear.projected - found.pixels, options.max_reprojection_error)
     shared = shared_variance(camera, field, options) * np.linalg.inv(information_of_a_match)
     return pose, covariance * inflation + shared
 
@@ -285,64 +289,8 @@ def whiten(
     camera: Camera, T_map_camera: np.ndarray, found: Correspondences, residuals: np.ndarray
 ) -> np.ndarray | None:
     """Return matrices (M, 2, 2) that whiten residuals (M, 2) at a pose (4, 4); None with points that are not ahead."""
-    linear = _linearize(camera, T_map_camera, found)
+    linear = linearize(camera, T_map_camera, found.points)
     return None if linear is None else _whitening(residuals, _apply(linear.by_point, found.sigmas))
-
-
-class _Linear(NamedTuple):
-    """Residuals (M, 2), and their Jacobians (M, 2, 6) by (translation, rotation) of the pose, (M, 2, 3) by the point.
-
-    The pose moves as t + dt, exp(dr) R, both in the map frame.
-    """
-
-    residuals: np.ndarray
-    by_pose: np.ndarray
-    by_point: np.ndarray
-
-
-def project_with_jacobians(
-    camera: Camera, pose: np.ndarray, points: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-    """Return the pixels (M, 2) of points (M, 3) of the map, and their Jacobians by pose and point as of a _Linear.
-
-    None where a point is not ahead of the camera at the pose (4, 4).
-    """
-    offsets = points - pose[:3, 3]
-    in_camera = offsets @ pose[:3, :3]
-    z = in_camera[:, 2:]
-    if not (z > 0).all():
-        return None
-    homogeneous = in_camera @ camera.K.T
-    # The quotient rule, for u and v: (K_r - pixel e_z) / z.
-    by_camera_point = camera.K[:2] / z[..., None]
-    projected = homogeneous[:, :2] / z
-    by_camera_point[:, :, 2] -= projected / z
-    by_point = by_camera_point @ pose[:3, :3].T
-    by_pose = np.concatenate([-by_point, by_point @ skew(offsets)], axis=2)
-    return projected, by_pose, by_point
-
-
-def _linearize(camera: Camera, pose: np.ndarray, found: Correspondences) -> _Linear | None:
-    """Return the residuals at a pose (4, 4) and their Jacobians; None where a point is not ahead of the camera."""
-    jacobians = project_with_jacobians(camera, pose, found.points)
-    if jacobians is None:
-        return None
-    projected, by_pose, by_point = jacobians
-    return _Linear(projected - found.pixels, by_pose, by_point)
-
-
-def _normal_equations(whitening: np.ndarray, linear: _Linear, cauchy_scale: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return Hessian (6, 6) and gradient (6,) of the Cauchy-weighted problem (iteratively reweighted least squares)."""
-    white_residuals = _apply(whitening, linear.residuals)
-    white_jacobian = whitening @ linear.by_pose
-    weights = _cauchy_weights((white_residuals**2).sum(axis=1), cauchy_scale)
-    weighted = (white_jacobian * weights[:, None, None]).reshape(-1, 6)
-    return weighted.T @ white_jacobian.reshape(-1, 6), weighted.T @ white_residuals.ravel()
-
-
-def _cauchy_weights(squared: np.ndarray, scale: float) -> np.ndarray:
-    """Return the weights (M,) of residuals by their squared whitened lengths (M,)."""
-    return 1.0 / (1.0 + squared / scale**2)
 
 
 def _whitening(residuals: np.ndarray, smears: np.ndarray) -> np.ndarray:

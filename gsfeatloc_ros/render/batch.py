@@ -1,6 +1,6 @@
 """Splats of a tile, a batch at a time, in the form in which they are blended, and which of its blocks each touches."""
 
-# Kernels take as many parameters as they need: render/kernels.py says why.
+# Kernels take as many parameters as they need: common/kernels.py says why.
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import math
 
 import numpy as np
 
+from gsfeatloc_ros.common.kernels import njit
 from gsfeatloc_ros.render import base
-from gsfeatloc_ros.render.kernels import njit
 from gsfeatloc_ros.render.lanes import (
     LANES,
     SQUARE,

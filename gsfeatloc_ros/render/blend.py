@@ -1,6 +1,6 @@
 """Kernels 2 and 3 of a frame: gather the splats of each tile; sort them by depth and blend them into the images."""
 
-# Kernels take as many parameters as they need: render/kernels.py says why.
+# Kernels take as many parameters as they need: common/kernels.py says why.
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ import numpy as np
 from llvmlite import ir
 from numba import types
 
+from gsfeatloc_ros.common.kernels import intrinsic, njit, prange
 from gsfeatloc_ros.render import base
 from gsfeatloc_ros.render.batch import BATCH_ROWS, BATCH_SIZE, BLOCKS, BLOCKS_X, DEPTH2, load_batch, record
 from gsfeatloc_ros.render.depth_sort import sorted_by_depth
-from gsfeatloc_ros.render.kernels import intrinsic, njit, prange
 from gsfeatloc_ros.render.lanes import (
     LANES,
     SQUARE,

@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from gsfeatloc_ros.common.camera import Camera
+from gsfeatloc_ros.common.kernels import njit
 from gsfeatloc_ros.render.base import EPS2D, MIN_ALPHA, NEAR_PLANE
-from gsfeatloc_ros.render.kernels import njit
 
 # Pixels by which the blur can widen a Gaussian.
 _MAX_BLUR = np.sqrt(2 * np.log(1.0 / MIN_ALPHA) * EPS2D)

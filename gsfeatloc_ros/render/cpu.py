@@ -8,6 +8,7 @@ from functools import partial
 import numpy as np
 
 from gsfeatloc_ros.common.camera import Camera
+from gsfeatloc_ros.common.kernels import max_threads, set_threads
 from gsfeatloc_ros.maps.gaussian_map import SH_COEFFICIENTS, GaussianMap
 from gsfeatloc_ros.render.base import DEFAULT_DRAW_OPTIONS, DrawOptions, Render, SplatRenderer, Stage, check_range
 from gsfeatloc_ros.render.blend import blend, gather, tile_starts
@@ -15,7 +16,6 @@ from gsfeatloc_ros.render.camera_view import camera_view
 from gsfeatloc_ros.render.chunks import CHUNK, KERNEL_LOCK, PreparedMap
 from gsfeatloc_ros.render.cut import Cut
 from gsfeatloc_ros.render.enlarge import draw_scaled
-from gsfeatloc_ros.render.kernels import max_threads, set_threads
 from gsfeatloc_ros.render.prepare import prepare
 from gsfeatloc_ros.render.project import SPLAT_SIZE, TILE, project
 

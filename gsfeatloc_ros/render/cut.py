@@ -1,6 +1,6 @@
 """Which chunks of a map a view is drawn from: all that it may see, or coarser ones where these are seen small."""
 
-# Kernels take as many parameters as they need: render/kernels.py says why.
+# Kernels take as many parameters as they need: common/kernels.py says why.
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ import math
 
 import numpy as np
 
+from gsfeatloc_ros.common.kernels import njit
 from gsfeatloc_ros.render.base import NEAR_PLANE
 from gsfeatloc_ros.render.camera_view import CameraView, frustum, is_outside, visible_chunks
 from gsfeatloc_ros.render.chunks import BRANCHING, CHUNK, LARGE_MAP, PreparedMap
-from gsfeatloc_ros.render.kernels import njit
 from gsfeatloc_ros.render.levels import MAX_SIZE
 
 # A view of a large map is drawn from no more chunks, a million Gaussians: memory and time have this bound. Where it

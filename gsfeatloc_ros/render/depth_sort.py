@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsfeatloc_ros.render.kernels import njit
+from gsfeatloc_ros.common.kernels import njit
 
 # Of a digit of the sort.
 _DIGIT_BITS = 8

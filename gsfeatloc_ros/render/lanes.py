@@ -16,7 +16,7 @@ from numba.core.typing import signature
 from numba.core.typing.templates import AbstractTemplate, infer_global
 from numba.extending import lower_builtin, models, register_model
 
-from gsfeatloc_ros.render.kernels import intrinsic, njit
+from gsfeatloc_ros.common.kernels import intrinsic, njit
 
 LANES = 16
 # Lanes as a square of pixels.

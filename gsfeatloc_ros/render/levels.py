@@ -1,6 +1,6 @@
 """The coarser levels of a large map: Gaussians that each stand for four, for what is seen small."""
 
-# Kernels take as many parameters as they need: render/kernels.py says why.
+# Kernels take as many parameters as they need: common/kernels.py says why.
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import math
 
 import numpy as np
 
+from gsfeatloc_ros.common.kernels import njit, prange
 from gsfeatloc_ros.render.base import EPS2D, MAX_ALPHA, MIN_ALPHA
 from gsfeatloc_ros.render.chunks import (
     BRANCHING,
@@ -24,7 +25,6 @@ from gsfeatloc_ros.render.chunks import (
     MEAN_X,
     PreparedMap,
 )
-from gsfeatloc_ros.render.kernels import njit, prange
 from gsfeatloc_ros.render.store import grow_box, half_bits
 
 # A chunk of merged Gaussians is drawn where they are seen no larger than this, one standard deviation in pixels: they

@@ -1,6 +1,6 @@
 """What is made of a map once, when it is loaded: Gaussians in the order and form that the CPU renderer needs."""
 
-# Kernels take as many parameters as they need: render/kernels.py says why.
+# Kernels take as many parameters as they need: common/kernels.py says why.
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from gsfeatloc_ros.common.kernels import njit, prange
 from gsfeatloc_ros.maps.gaussian_map import GaussianMap
 from gsfeatloc_ros.render.base import MIN_ALPHA
 from gsfeatloc_ros.render.chunks import (
@@ -29,7 +30,6 @@ from gsfeatloc_ros.render.chunks import (
     PreparedMap,
     level_starts,
 )
-from gsfeatloc_ros.render.kernels import njit, prange
 from gsfeatloc_ros.render.levels import merge_levels
 from gsfeatloc_ros.render.store import grow_box, half_bits
 

@@ -1,6 +1,6 @@
 """Kernel 1 of a frame: project the Gaussians, colour them, and list the tiles that each touches."""
 
-# Kernels take as many parameters as they need: render/kernels.py says why.
+# Kernels take as many parameters as they need: common/kernels.py says why.
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import math
 
 import numpy as np
 
+from gsfeatloc_ros.common.kernels import njit, prange
 from gsfeatloc_ros.render import base, prepare
-from gsfeatloc_ros.render.kernels import njit, prange
 from gsfeatloc_ros.render.lanes import (
     LANES,
     bits_of_float,

@@ -1,6 +1,6 @@
 """How kernels write Gaussians into chunks: colours in half precision, and the boxes of chunks."""
 
-# Kernels take as many parameters as they need: render/kernels.py says why.
+# Kernels take as many parameters as they need: common/kernels.py says why.
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import math
 
 import numpy as np
 
+from gsfeatloc_ros.common.kernels import njit
 from gsfeatloc_ros.render.chunks import COV_XX, COV_YY, COV_ZZ, MEAN_X
-from gsfeatloc_ros.render.kernels import njit
 from gsfeatloc_ros.render.lanes import bits_of_float
 
 _MIN_HALF, _MAX_HALF = np.float32(2.0**-14), np.float32(65504)

@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.geometry import invert, make_pose, so3_exp, so3_log, transform
-from gsfeatloc_ros.pose.camera_fit import CameraFit, _linearize, fit_camera
+from gsfeatloc_ros.pose.camera_fit import CameraFit, fit_camera
+from gsfeatloc_ros.pose.linear import linearize
 from gsfeatloc_ros.pose.solve import Correspondences, PoseOptions, PoseSolution, solve_pose
 
 CAMERA = Camera(640, 480, np.array([[600.0, 0, 315], [0, 610.0, 245], [0, 0, 1]]))
@@ -108,9 +109,9 @@ def test_jacobians_equal_finite_differences() -> None:
 
     def residuals(step: np.ndarray) -> np.ndarray:
         pose = make_pose(so3_exp(step[3:6]) @ POSE[:3, :3], POSE[:3, 3] + step[:3])
-        return _linearize(CAMERA, pose, extra + step[6:], found)[0]
+        return linearize(CAMERA, pose, found.points, extra + step[6:], found.pixels[:, 1]).projected
 
-    _, jacobian = _linearize(CAMERA, POSE, extra, found)
+    jacobian = linearize(CAMERA, POSE, found.points, extra, found.pixels[:, 1]).by_state
     size = 1e-6
     for column, step in enumerate(size * np.eye(11)):
         slope = (residuals(step) - residuals(-step)) / (2 * size)

@@ -21,12 +21,12 @@ from gsfeatloc_ros.common.geometry import (
     translation_error,
 )
 from gsfeatloc_ros.pose.lift import DEPTH_SIGMA_PER_STD, MAX_DEPTH_STD, LiftOptions, lift
+from gsfeatloc_ros.pose.linear import linearize
 from gsfeatloc_ros.pose.residual_field import ResidualField
 from gsfeatloc_ros.pose.solve import (
     MIN_POINTS,
     Correspondences,
     PoseOptions,
-    _linearize,
     refine_pose,
     reprojection_errors,
     shared_variance,
@@ -216,13 +216,13 @@ def test_jacobians_equal_finite_differences() -> None:
 
     def residuals(by_pose: np.ndarray, by_point: np.ndarray) -> np.ndarray:
         pose = make_pose(so3_exp(by_pose[3:]) @ POSE[:3, :3], POSE[:3, 3] + by_pose[:3])
-        return _linearize(camera, pose, replace(found, points=found.points + by_point)).residuals
+        return linearize(camera, pose, found.points + by_point).projected
 
-    linear = _linearize(camera, POSE, found)
+    linear = linearize(camera, POSE, found.points)
     step = 1e-6
     for k, delta in enumerate(step * np.eye(6)):
         slope = (residuals(delta, np.zeros(3)) - residuals(-delta, np.zeros(3))) / (2 * step)
-        np.testing.assert_allclose(linear.by_pose[:, :, k], slope, rtol=1e-5, atol=1e-4)
+        np.testing.assert_allclose(linear.by_state[:, :, k], slope, rtol=1e-5, atol=1e-4)
     for k, delta in enumerate(step * np.eye(3)):
         slope = (residuals(np.zeros(6), delta) - residuals(np.zeros(6), -delta)) / (2 * step)
         np.testing.assert_allclose(linear.by_point[:, :, k], slope, rtol=1e-5, atol=1e-4)

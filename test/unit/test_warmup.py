@@ -43,7 +43,7 @@ def run(root: Path, *arguments: str, **variables: str) -> str:
 
 
 def cache_dir(root: Path, **variables: str) -> str:
-    code = "import os, gsfeatloc_ros.render.kernels; print(os.environ.get('NUMBA_CACHE_DIR'))"
+    code = "import os, gsfeatloc_ros.common.kernels; print(os.environ.get('NUMBA_CACHE_DIR'))"
     return run(root, "-c", code, **variables).strip()
 
 

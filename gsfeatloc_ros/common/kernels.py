@@ -1,4 +1,4 @@
-"""numba as all kernels of this folder import it: with a place to keep what it compiles, set before the first of them.
+"""numba as all kernels import it: with a place to keep what it compiles, set before the first of them.
 
 Kernels and intrinsics are not typed: what numba makes of them takes types of its own. Nor do they keep to five
 parameters: numba passes arrays and numbers at no cost, and objects of Python not at all.
