@@ -11,6 +11,7 @@ from gsfeatloc_ros.common.arrays import Array, to_host
 from gsfeatloc_ros.common.local_structure import local_structure
 from gsfeatloc_ros.common.photo import Photo
 from gsfeatloc_ros.match.base import Matches, Worth, all_of_them
+from gsfeatloc_ros.match.flow import WINDOW, Pyramid, flow
 
 # Corners (Shi and Tomasi, 1994): how many, how many pixels apart, of what part of the strongest one's strength, and
 # over a block of how many pixels a side that is measured.
@@ -24,16 +25,12 @@ CORNER_BLOCK = 5
 STRUCTURE_SIGMA = 12.0
 STRUCTURE_MIN_CONTRAST = 8.0
 STRUCTURE_GAIN = 40.0
-# Lucas-Kanade on a pyramid whose levels are 0 to this, in windows of these pixels.
-FLOW_WINDOW = (15, 15)
-MAX_FLOW_LEVEL = 3
-_FLOW_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.03)
 # Of a corner that is followed to the render and back, in pixels.
 MAX_RETURN_ERROR = 1.0
 
 
 class CornerTracker:
-    """Finds where the corners of a photo are in renders, by optical flow (Lucas and Kanade, 1981; Bouguet, 2001).
+    """Finds where the corners of a photo are in renders, by optical flow (match/flow.py).
 
     Where photo and render nearly coincide this is cheaper and more accurate than matching features: pixels are compared
     with pixels, all over the image. Both are reduced to their local structure first, as a map does not know today's
@@ -76,16 +73,16 @@ class CornerTracker:
 
 @dataclass(frozen=True, eq=False)
 class _Seen:
-    """A render, its brightness (H, W) uint8 and its local structure (H, W) uint8."""
+    """A render, its brightness (H, W) uint8 and its local structure."""
 
     image: Array
     gray: np.ndarray
-    structure: np.ndarray
+    structure: Pyramid
 
 
 def seen_off_the_border(photo: Photo) -> np.ndarray:
     """Return where to look for corners, (H, W) uint8: the border of what the lens saw is no corner of the world."""
-    return cv2.erode(photo.seen.astype(np.uint8), np.ones(FLOW_WINDOW, np.uint8))
+    return cv2.erode(photo.seen.astype(np.uint8), np.ones((WINDOW, WINDOW), np.uint8))
 
 
 def _find_corners(gray: np.ndarray, count: int, seen: np.ndarray | None) -> np.ndarray:
@@ -96,32 +93,18 @@ def _find_corners(gray: np.ndarray, count: int, seen: np.ndarray | None) -> np.n
     return np.empty((0, 2), np.float32) if corners is None else corners.reshape(-1, 2)
 
 
-def _there_and_back(here: np.ndarray, there: np.ndarray, corners: np.ndarray) -> Matches:
+def _there_and_back(here: Pyramid, there: Pyramid, corners: np.ndarray) -> Matches:
     """Match the corners (N, 2) of one structure with another; those that do not return to where they were left out."""
     if len(corners) == 0:
         return Matches.none()
-    moved, found = _flow(here, there, corners)
-    back, found_back = _flow(there, here, moved)
+    moved, found = flow(here, there, corners)
+    back, found_back = flow(there, here, moved)
     kept = found & found_back & (np.linalg.norm(back - corners, axis=1) <= MAX_RETURN_ERROR)
     pixels = corners[kept].astype(np.float64)
     return Matches(pixels, moved[kept].astype(np.float64), np.ones(len(pixels)))
 
 
-def _structure(gray: np.ndarray) -> np.ndarray:
-    """Return the local structure of brightness (H, W) uint8 as bytes (H, W)."""
+def _structure(gray: np.ndarray) -> Pyramid:
+    """Return the local structure of brightness (H, W) uint8, as bytes."""
     structure, _ = local_structure(gray, STRUCTURE_SIGMA, STRUCTURE_MIN_CONTRAST)
-    return cv2.addWeighted(structure, STRUCTURE_GAIN, structure, 0, 128, dtype=cv2.CV_8U)
-
-
-def _flow(here: np.ndarray, there: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Find where pixels (N, 2) of one image are in another: (N, 2), and which were found (N,) bool."""
-    moved, found, _ = cv2.calcOpticalFlowPyrLK(
-        here,
-        there,
-        pixels,
-        np.empty_like(pixels),
-        winSize=FLOW_WINDOW,
-        maxLevel=MAX_FLOW_LEVEL,
-        criteria=_FLOW_CRITERIA,
-    )
-    return moved, found[:, 0] == 1
+    return Pyramid(cv2.addWeighted(structure, STRUCTURE_GAIN, structure, 0, 128, dtype=cv2.CV_8U))

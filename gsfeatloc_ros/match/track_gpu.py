@@ -14,12 +14,11 @@ from torch.nn.functional import avg_pool2d, conv2d, grid_sample, max_pool2d, pad
 from gsfeatloc_ros.common.arrays import Array, to_device, to_host
 from gsfeatloc_ros.common.photo import Photo
 from gsfeatloc_ros.match.base import Matches, Worth, all_of_them
+from gsfeatloc_ros.match.flow import MAX_LEVEL, WINDOW
 from gsfeatloc_ros.match.tensor import LUMA
 from gsfeatloc_ros.match.track import (
     CORNER_BLOCK,
-    FLOW_WINDOW,
     MAX_CORNERS,
-    MAX_FLOW_LEVEL,
     MAX_RETURN_ERROR,
     MIN_CORNER_DISTANCE,
     MIN_CORNER_QUALITY,
@@ -209,9 +208,9 @@ class _Constants:
         self._scales = [self._scale(height, width, 1)]
         self._halvings = []
         # The coarsest level is larger than the window, as OpenCV's.
-        for level in range(1, MAX_FLOW_LEVEL + 1):
+        for level in range(1, MAX_LEVEL + 1):
             halved = (height + 1) // 2, (width + 1) // 2
-            if halved[0] <= FLOW_WINDOW[1] or halved[1] <= FLOW_WINDOW[0]:
+            if min(halved) <= WINDOW:
                 break
             self._halvings.append(self._filter(height, width, _HALVING_KERNEL, 2))
             height, width = halved
@@ -247,7 +246,7 @@ class _Constants:
         return self._tensor(rows), self._tensor(columns.T)
 
     def _scale(self, height: int, width: int, pixel: int) -> _Scale:
-        x, y = np.meshgrid(*(np.arange(size) - size // 2 for size in FLOW_WINDOW))
+        x, y = np.meshgrid(*(np.arange(size) - size // 2 for size in (WINDOW, WINDOW)))
         unit = 2 / np.maximum([width - 1, height - 1], 1)
         window = np.column_stack([x.ravel(), y.ravel()]) * unit - 1
         return _Scale(pixel, self._tensor(window), self._tensor(unit / pixel))

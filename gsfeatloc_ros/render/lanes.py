@@ -337,6 +337,19 @@ def whole(typingctx, values):
 
 
 @intrinsic
+def total(typingctx, values):
+    """Return the sum of all lanes, in whatever order is fastest."""
+
+    def codegen(context, builder, sig, args):
+        function_type = ir.FunctionType(ir.FloatType(), [ir.FloatType(), _FLOATS])
+        name = f"llvm.vector.reduce.fadd.v{LANES}f32"
+        function = cgutils.get_or_insert_function(builder.module, function_type, name)
+        return builder.call(function, [ir.Constant(ir.FloatType(), 0.0), args[0]], fastmath=("reassoc",))
+
+    return types.float32(_LANES), codegen
+
+
+@intrinsic
 def mask_bits(typingctx, mask):
     """Return the mask as a number, of which bit i is lane i."""
 
