@@ -33,14 +33,14 @@ from gsfeatloc_ros.localize.evidence import (
 from gsfeatloc_ros.localize.options import LocalizerOptions
 from gsfeatloc_ros.localize.prior import Prior
 from gsfeatloc_ros.localize.query import Components, MatchedView, Query
-from gsfeatloc_ros.localize.search import SEARCH_WIDTH, Search
+from gsfeatloc_ros.localize.search import Search
 from gsfeatloc_ros.match import Matcher, Tracker, create_tracker
 from gsfeatloc_ros.pose.camera_fit import CameraFit, fit_camera
 from gsfeatloc_ros.pose.solve import Correspondences, reprojection_errors
 from gsfeatloc_ros.render.base import Renderer
 
 # A render nearer to the photo than this many pixels is at the estimate.
-_MAX_SETTLED_OFFSET = 0.5
+_MAX_SETTLED_OFFSET = 1.0
 # With a blur of this extent, in pixels, corners may be off by twice the reprojection error allowed.
 _BLUR_THAT_DOUBLES_ERRORS = 25.0
 # Matches farther off than this many pixels say nothing of the camera.
@@ -142,8 +142,7 @@ class Localizer:
 
     def _search(self, query: Query, prior: Prior | None) -> Trace:
         """Look at small views of the map, at the prior and then where else it may be, and refine what they suggest."""
-        small = query.limited(SEARCH_WIDTH)
-        search = Search(small, prior, self._now)
+        search = Search(query, prior, self._now)
         likeliest: _Candidate | None = None
         try:
             reason = too_little(query)
@@ -161,7 +160,7 @@ class Localizer:
             return _out_of_time(query, search, likeliest)
         if likeliest is not None:
             return likeliest.trace(query.photo, search)
-        return _nothing_in_common(small, search, query.photo)
+        return _nothing_in_common(search, query.photo)
 
     def _candidates(self, query: Query, search: Search, prior: Prior | None) -> Iterator[_Candidate]:
         """Yield what the poses of a search lead to, judged."""
@@ -199,7 +198,7 @@ class Localizer:
         options = query.components.options
         few = replace(options, search=replace(options.search, max_views=_MIRROR_VIEWS, skipped=0))
         mirror = Query(replace(query.components, options=few), query.photo.mirrored(), query.clock)
-        search = Search(mirror.limited(SEARCH_WIDTH), None, self._now)
+        search = Search(mirror, None, self._now)
         found = []
         for pose in islice(search.poses(), _MIRROR_POSES):
             candidate = self._refine(mirror, pose, None)
@@ -333,10 +332,10 @@ def _out_of_time(query: Query, search: Search, likeliest: _Candidate | None) -> 
     return replace(likeliest.trace(query.photo, search), estimate=estimate)
 
 
-def _nothing_in_common(small: Query, search: Search, photo: Photo) -> Trace:
+def _nothing_in_common(search: Search, photo: Photo) -> Trace:
     """None of the views that were searched suggested a pose; it may be that the map is read wrong."""
-    looked, features, reading = search.looked, len(small.features), small.components.renderer.reading
-    reason = too_few_features(small)
+    looked, features, reading = search.looked, len(search.small.features), search.small.components.renderer.reading
+    reason = too_few_features(search.small)
     if reason:
         return Trace(Estimate(Status.FAILED, reason, evidence=search.counted(Evidence())), photo)
     if search.best is None and not looked:

@@ -15,6 +15,9 @@ from gsfeatloc_ros.render.base import Render
 _REACH = 0.12
 # What tracking in vain costs (a view is rendered anyway), as a share of what features cost when it is not.
 _COST = 0.15
+# A prior from which the photo is off by about this many pixels of the full picture is looked at in full size at once:
+# one pass there costs less, then, than a small one before it.
+_SETTLED = 2.0
 # Pixels across and down a render at which it is told how far the photo may be off.
 _GRID = (8, 6)
 
@@ -27,6 +30,16 @@ def is_worth_tracking(render: Render, camera: Camera, prior: Prior) -> bool:
     sigma = expected_offset(render, camera, prior) / camera.width
     # What is off by a Gaussian along both axes is Rayleigh distributed.
     return bool(1.0 - np.exp(-((_REACH / max(sigma, 1e-9)) ** 2)) > _COST)
+
+
+def may_be_settled(camera: Camera, prior: Prior) -> bool:
+    """Return whether a photo may be where its prior is, to a pixel or two, by what the prior knows of the rotation."""
+    return bool(camera.K[0, 0] * np.sqrt(np.trace(prior.usual_covariance[3:, 3:]) / 3) <= _SETTLED)
+
+
+def is_settled(render: Render, camera: Camera, prior: Prior) -> bool:
+    """Return whether a photo usually is where its prior is, to a pixel or two, by the full-size render there."""
+    return expected_offset(render, camera, prior) <= _SETTLED
 
 
 def expected_offset(render: Render, camera: Camera, prior: Prior) -> float:

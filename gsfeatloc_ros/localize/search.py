@@ -16,7 +16,7 @@ from gsfeatloc_ros.localize.content import MIN_FEATURES
 from gsfeatloc_ros.localize.evidence import Evidence
 from gsfeatloc_ros.localize.prior import Prior
 from gsfeatloc_ros.localize.query import MatchedView, Query
-from gsfeatloc_ros.localize.reach import is_worth_tracking
+from gsfeatloc_ros.localize.reach import is_settled, is_worth_tracking, may_be_settled
 from gsfeatloc_ros.localize.retrieval import Hint, retrieve
 from gsfeatloc_ros.match.base import Features
 
@@ -55,18 +55,20 @@ class Search:
     """The search for poses of one photo that are worth a closer look.
 
     Args:
-        small: the photo, at most SEARCH_WIDTH wide.
+        query: the photo.
         prior: of its pose, None for none.
         now: clock, in seconds.
 
     Attributes:
+        small: the photo, at most SEARCH_WIDTH wide.
         best: the view that had most in common with the photo so far; None before one was rendered.
         views: number of views, other than the prior's, that were rendered to find the photo.
         searched: number of the index's views that were compared with it.
     """
 
-    def __init__(self, small: Query, prior: Prior | None, now: Callable[[], float]) -> None:
-        self._small, self._prior, self._now = small, prior, now
+    def __init__(self, query: Query, prior: Prior | None, now: Callable[[], float]) -> None:
+        self._query, self._prior, self._now = query, prior, now
+        self.small = query.limited(SEARCH_WIDTH)
         self.best: MatchedView | None = None
         self.views = self.searched = self._around = 0
         self._at_prior = False
@@ -82,12 +84,12 @@ class Search:
         """Yield poses (4, 4) of the photo, as long as one is asked for and views are left."""
         if self._prior is not None:
             yield from self._tracked(self._prior)
-        if len(self._small.features) < MIN_FEATURES:
+        if len(self.small.features) < MIN_FEATURES:
             return
         tracked = len(self._tried)
         if self._prior is not None:
-            yield from self._hints(look(self._small, [self._prior.pose]))
-        if self._small.components.index is not None:
+            yield from self._hints(look(self.small, [self._prior.pose]))
+        if self.small.components.index is not None:
             yield from self._indexed()
         # Once a pose was refined, and is refused, others near the prior are no better.
         if self._prior is not None and len(self._tried) == tracked:
@@ -96,7 +98,7 @@ class Search:
                 batch = poses[start : start + _BATCH]
                 self._around += len(batch)
                 self.views += len(batch)
-                yield from self._hints(look(self._small, batch))
+                yield from self._hints(look(self.small, batch))
 
     @property
     def looked(self) -> str:
@@ -114,12 +116,12 @@ class Search:
 
     @property
     def _index_views(self) -> int:
-        index = self._small.components.index
+        index = self.small.components.index
         return 0 if index is None else len(index)
 
     def rivals(self, found: MatchedView) -> Iterator[np.ndarray]:
         """Yield poses (4, 4), far from the one `found`, that explain the photo as well by the index and the prior."""
-        index, camera = self._small.components.index, self._small.photo.camera
+        index, camera = self.small.components.index, self.small.photo.camera
         if index is None or found.solution is None:
             return
         place = _Place.of(found)
@@ -128,9 +130,9 @@ class Search:
         if self.searched == 0:
             # It was found at the prior, and stands by it, unless the prior holds others for possible too.
             elsewhere = [pose for pose in elsewhere if self._likely(pose)]
-        elif isinstance(self._small.features, Features):
-            nearest = self._small.nearest
-            with self._small.clock.stage("search"):
+        elif isinstance(self.small.features, Features):
+            nearest = self.small.nearest
+            with self.small.clock.stage("search"):
                 elsewhere += poses_elsewhere(index, camera, nearest, place.pose)
 
         def is_known(pose: np.ndarray) -> bool:
@@ -143,21 +145,29 @@ class Search:
                 yield pose
 
     def _spread(self, prior: Prior) -> list[np.ndarray]:
-        options = self._small.components.options
+        options = self.small.components.options
         min_step = _MIN_VIEW_STEP * np.sqrt(options.prior_covariance().diagonal())
-        has_index = self._small.components.index is not None
+        has_index = self.small.components.index is not None
         count = min(options.max_views, _VIEWS_AFTER_INDEX) if has_index else options.max_views
         return spread_poses(prior.pose, prior.covariance, min_step, count, options.seed)
 
     def _tracked(self, prior: Prior) -> Iterator[np.ndarray]:
-        """Yield the pose to which the photo is tracked from the prior, where that is likely to be cheaper."""
-        camera, render = self._small.photo.camera, self._small.render(prior.pose)
+        """Yield the prior's pose where the photo is there, or that to which it is tracked from there.
+
+        Only where that is likely to be cheaper than to find features.
+        """
         self._at_prior = True
+        full = self._query.photo.camera
+        if may_be_settled(full, prior) and is_settled(self._query.render(prior.pose), full, prior):
+            yield prior.pose
+            if self._tried:
+                return
+        camera, render = self.small.photo.camera, self.small.render(prior.pose)
         if not is_worth_tracking(render, camera, prior):
             return
-        view = self._small.track_from_afar(prior.pose)
+        view = self.small.track_from_afar(prior.pose)
         if view.solution is not None and view.offset(camera) > _MAX_TRACKED_OFFSET * camera.width:
-            view = self._small.track_from_afar(view.solution.T_map_camera)
+            view = self.small.track_from_afar(view.solution.T_map_camera)
         if view.solution is not None and view.inliers >= MIN_HINT:
             yield view.solution.T_map_camera
 
@@ -174,9 +184,9 @@ class Search:
 
     def _indexed(self) -> Iterator[np.ndarray]:
         """Compare the photo with the index's views and yield the poses that the best of them suggest."""
-        options = self._small.components.options.search
+        options = self.small.components.options.search
         end = self._now() + options.max_seconds
-        hints = islice(retrieve(self._small, self._likely, options.skipped), options.max_views)
+        hints = islice(retrieve(self.small, self._likely, options.skipped), options.max_views)
         while self._compare(islice(hints, _BATCH)) and self._now() < end:
             yield from self._follow(_MAX_FOLLOWED_VIEWS, MIN_HINT)
         yield from self._follow(_MAX_FOLLOWED_HINTS, _MIN_INDEX_HINT)
@@ -205,14 +215,14 @@ class Search:
                 yield pose
 
     def _was_tried(self, pose: np.ndarray) -> bool:
-        camera = self._small.photo.camera
+        camera = self.small.photo.camera
         return any(place.offset(camera, pose) < _MIN_DISTANCE_OF_TRIES for place in self._tried)
 
     def _confirmed(self, pose: np.ndarray) -> np.ndarray | None:
         """Return the pose (4, 4) of the photo by a render at a suggested one; None where too little agrees."""
         if self._was_tried(pose):
             return None
-        view = self._small.match(pose)
+        view = self.small.match(pose)
         self.views += 1
         self._saw(view)
         return view.solution.T_map_camera if view.solution and view.inliers >= CONFIRMED_HINT else None

@@ -31,7 +31,7 @@ Lookup = Callable[[str, str, int], np.ndarray]
 _MAX_IMAGE_DELAY = 5.0
 # What is gone on from, and how far off (6, 6) that usually is to begin with: map units and radians.
 _ANSWERS = (PriorSource.LAST_ANSWER, PriorSource.UNCONFIRMED)
-_OF_ANSWERS = isotropic_covariance(0.01, np.radians(0.5))
+_OF_ANSWERS = isotropic_covariance(0.003, np.radians(0.05))
 
 
 class InputTopic(Enum):

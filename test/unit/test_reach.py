@@ -12,9 +12,9 @@ from gsfeatloc_ros.common.geometry import invert, isotropic_covariance, make_pos
 from gsfeatloc_ros.localize.localizer import Localizer
 from gsfeatloc_ros.localize.options import LocalizerOptions, SearchOptions
 from gsfeatloc_ros.localize.prior import Prior
-from gsfeatloc_ros.localize.reach import expected_offset, is_worth_tracking
+from gsfeatloc_ros.localize.reach import expected_offset, is_settled, is_worth_tracking, may_be_settled
 from gsfeatloc_ros.match import create_matcher
-from gsfeatloc_ros.render import Render, create_renderer
+from gsfeatloc_ros.render import Render, Renderer, create_renderer
 
 CAMERA = Camera(320, 240, np.array([[260.0, 0, 159.5], [0, 260.0, 119.5], [0, 0, 1]]))
 POSE = make_pose(so3_exp(np.array([0.3, -0.2, 1.0])), np.array([1.0, 2.0, 3.0]))
@@ -67,6 +67,46 @@ def test_of_an_answer_that_is_gone_on_from_counts_how_far_off_it_usually_is() ->
     known = Prior.of(POSE, UNSURE, LocalizerOptions(search=search))
     assert is_worth_tracking(wall(2.0), CAMERA, known)
     assert known.deviation(moved(POSE, np.full(6, 0.5))) == prior(UNSURE).deviation(moved(POSE, np.full(6, 0.5)))
+
+
+@pytest.mark.parametrize(
+    ("metres", "degrees", "settled"), [(0.001, 0.05, True), (0.001, 1.0, False), (0.1, 0.05, False)]
+)
+def test_what_is_known_to_a_pixel_is_settled(metres: float, degrees: float, settled: bool) -> None:
+    known = prior(isotropic_covariance(metres, np.radians(degrees)))
+    assert is_settled(wall(2.0), CAMERA, known) == settled
+    assert may_be_settled(CAMERA, known) or not settled
+    assert not is_settled(wall(np.nan), CAMERA, known)
+
+
+class Recording:
+    """A renderer that keeps the widths of what it drew."""
+
+    def __init__(self, renderer: Renderer) -> None:
+        self._renderer, self.widths = renderer, []
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self._renderer, name)
+
+    def render(self, camera: Camera, T_map_camera: np.ndarray) -> Render:
+        self.widths.append(camera.width)
+        return self._renderer.render(camera, T_map_camera)
+
+
+def test_a_stream_takes_one_look_an_image(room_map, room_camera, room_photos) -> None:
+    """What is known to a pixel is rendered once, in full size; a claim that is false is found out and mended."""
+    photo, renderer = room_photos[0], Recording(create_renderer(room_map))
+    localizer = Localizer(renderer, create_matcher("sift"))
+    known = isotropic_covariance(0.002, np.radians(0.03))
+    answer = localizer.localize(photo.image, room_camera, photo.T_map_camera, isotropic_covariance(0.02, 0.01))
+    renderer.widths.clear()
+    again = localizer.localize(photo.image, room_camera, answer.T_map_camera, known)
+    assert renderer.widths == [room_camera.width]
+    np.testing.assert_allclose(again.T_map_camera, answer.T_map_camera, atol=1e-3)
+    off = moved(answer.T_map_camera, np.array([0.02, -0.01, 0.02, 0.01, -0.02, 0.01]))
+    mended = localizer.localize(photo.image, room_camera, off, known)
+    assert len(renderer.widths) > 2
+    np.testing.assert_allclose(mended.T_map_camera, answer.T_map_camera, atol=2e-3)
 
 
 @pytest.fixture(scope="module")
