@@ -17,7 +17,7 @@ from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.photo import Photo
 from gsfeatloc_ros.common.stage_clock import OutOfTime, StageClock
 from gsfeatloc_ros.index import ViewIndex
-from gsfeatloc_ros.localize.blur import estimate_blur
+from gsfeatloc_ros.localize.blur import Blur, estimate_blur
 from gsfeatloc_ros.localize.comparison import changed_mask, compare, preference
 from gsfeatloc_ros.localize.content import too_few_features, too_little
 from gsfeatloc_ros.localize.estimate import Estimate, Status, Trace
@@ -39,8 +39,9 @@ from gsfeatloc_ros.pose.camera_fit import CameraFit, fit_camera
 from gsfeatloc_ros.pose.solve import Correspondences, reprojection_errors
 from gsfeatloc_ros.render.base import Renderer
 
-# A render nearer to the photo than this many pixels is at the estimate.
-_MAX_SETTLED_OFFSET = 1.0
+# A render nearer to the photo than this many pixels is at the estimate. Where it is not believed it is looked at from
+# nearer: photo and render are a little more alike then.
+_MAX_SETTLED_OFFSET, _MAX_DOUBTED_OFFSET = 1.0, 0.5
 # With a blur of this extent, in pixels, corners may be off by twice the reprojection error allowed.
 _BLUR_THAT_DOUBLES_ERRORS = 25.0
 # Matches farther off than this many pixels say nothing of the camera.
@@ -215,20 +216,19 @@ class Localizer:
         if blur is not None and passes < max_passes:
             view = query.track(pose if view.solution is None else view.solution.T_map_camera, blur)
             passes += 1
-        while (
-            view.solution is not None and view.offset(query.photo.camera) >= _MAX_SETTLED_OFFSET and passes < max_passes
-        ):
-            view = query.track(view.solution.T_map_camera, blur)
-            passes += 1
-        evidence = Evidence(
-            corners=len(query.tracker.corners),
-            matches=view.matches,
-            lifted=len(view.found.pixels),
-            inliers=view.inliers,
-            blur_px=blur.extent if blur else 0.0,
-            passes=passes,
-        )
-        return self._verify(query, view, evidence, prior)
+
+        def approach(view: MatchedView, max_offset: float) -> MatchedView:
+            nonlocal passes
+            while view.solution and view.offset(query.photo.camera) >= max_offset and passes < max_passes:
+                view = query.track(view.solution.T_map_camera, blur)
+                passes += 1
+            return view
+
+        view = approach(view, _MAX_SETTLED_OFFSET)
+        candidate = self._verify(query, view, _counted(query, view, blur, passes), prior)
+        if not candidate.believed and (nearer := approach(view, _MAX_DOUBTED_OFFSET)) is not view:
+            candidate = self._verify(query, nearer, _counted(query, nearer, blur, passes), prior)
+        return candidate
 
     def _verify(self, query: Query, view: MatchedView, evidence: Evidence, prior: Prior | None) -> _Candidate:
         """Collect what speaks for the pose that the last view gave, and what against it."""
@@ -261,6 +261,18 @@ class Localizer:
             )
             evidence = replace(evidence, probability_wrong=probability_wrong(evidence))
             return _Candidate(view, evidence, fit, verdict(evidence, options.limits))
+
+
+def _counted(query: Query, view: MatchedView, blur: Blur | None, passes: int) -> Evidence:
+    """Return what there is to count of a view before it is verified."""
+    return Evidence(
+        corners=len(query.tracker.corners),
+        matches=view.matches,
+        lifted=len(view.found.pixels),
+        inliers=view.inliers,
+        blur_px=blur.extent if blur else 0.0,
+        passes=passes,
+    )
 
 
 def _near(view: MatchedView) -> Correspondences:
