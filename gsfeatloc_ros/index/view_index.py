@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.sparse import csr_array
 
+from gsfeatloc_ros.common.arrays import to_host
 from gsfeatloc_ros.index.landmarks import Landmarks
 from gsfeatloc_ros.match.base import Features, Matches
 from gsfeatloc_ros.match.nearest import match_mutual
@@ -77,7 +78,7 @@ class ViewIndex:
     def nearest(self, features: Features) -> Nearest:
         """Find what looks most like the features of a picture in all views: 32 landmarks, or as many as there are."""
         distances, numbers = self._search.search(features.descriptors, min(_NEIGHBOURS, len(self.codes)))
-        return Nearest(features.keypoints, np.where(numbers >= 0, distances, np.inf), numbers)
+        return Nearest(to_host(features.keypoints), np.where(numbers >= 0, distances, np.inf), numbers)
 
     def rank(self, nearest: Nearest) -> np.ndarray:
         """Return the number of features of a photo (N,) float64 that speak for each view.

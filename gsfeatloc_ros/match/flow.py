@@ -41,7 +41,8 @@ class Pyramid:
         """The levels, (H + 2 border, W + 2 border) float32, continued by their reflections; none less than a window."""
         level, levels = self._picture, []
         for _ in range(MAX_LEVEL + 1):
-            levels.append(cv2.copyMakeBorder(level, *[_BORDER] * 4, cv2.BORDER_REFLECT_101).astype(np.float32))
+            bordered = cv2.copyMakeBorder(level, _BORDER, _BORDER, _BORDER, _BORDER, cv2.BORDER_REFLECT_101)
+            levels.append(bordered.astype(np.float32))
             level = cv2.pyrDown(level)
             if min(level.shape) <= WINDOW:
                 break

@@ -48,7 +48,8 @@ class ResidualField:
         pixels, residuals = pixels[::step], residuals[::step]
         agrees = (residuals**2).sum(axis=1) <= max_error**2
         total = 0.5 * float((residuals[agrees] ** 2).sum(axis=1).mean()) if agrees.any() else 0.0
-        return ResidualField(*_means(pixels, residuals, agrees), total)
+        near, smooth = _means(pixels, residuals, agrees)
+        return ResidualField(near, smooth, total)
 
     @property
     def bent_variance(self) -> float:
