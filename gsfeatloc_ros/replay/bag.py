@@ -21,6 +21,8 @@ _ODOMETRY = "nav_msgs/msg/Odometry"
 _TF = "tf2_msgs/msg/TFMessage"
 # How a message begins that was compressed by itself; those of ROS 2 begin with a zero.
 _ZSTD = b"\x28\xb5\x2f\xfd"
+# Of one, unpacked: an image of 50 megapixels of 8 bytes.
+_MAX_MESSAGE_BYTES = 400_000_000
 
 
 class Role(Enum):
@@ -108,7 +110,7 @@ class Bag:
                     raise BagError(f"{self.path}: is damaged, and ends here: {in_words(error)}") from error
                 message, problem = None, ""
                 try:
-                    cdr = zstd.decompress(cdr) if cdr.startswith(_ZSTD) else cdr
+                    cdr = _unpacked(cdr) if cdr.startswith(_ZSTD) else cdr
                     message = self._types.deserialize_cdr(cdr, channel.type)
                 except Exception as error:  # the same
                     problem = f"the bytes of this message are no {channel.type}: {in_words(error)}"
@@ -147,6 +149,15 @@ def open_bag(path: Path, topics: Mapping[Role, Sequence[str]]) -> Iterator[Bag]:
         start, seconds = min(times), 1e-9 * (max(times) - min(times))
         types = get_typestore(Stores.ROS2_JAZZY)
         yield Bag(path, files[0].storage, images, start, seconds, files, roles, types)
+
+
+def _unpacked(compressed: bytes) -> bytes:
+    """Return the bytes of a message that was compressed by itself; raise ValueError or ZstdError where that fails."""
+    decompressor = zstd.ZstdDecompressor()
+    cdr = decompressor.decompress(compressed, _MAX_MESSAGE_BYTES)
+    if not decompressor.eof:
+        raise ValueError(f"it was cut short, or unpacks to more than {_MAX_MESSAGE_BYTES // 10**6} megabytes")
+    return bytes(cdr)
 
 
 def _is_there(path: Path, files: Sequence[BagFile], role: Role, topic: str) -> bool:

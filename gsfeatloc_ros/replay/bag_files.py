@@ -24,11 +24,17 @@ from mcap.records import Schema, Statistics
 from mcap.summary import Summary
 from rosbags.rosbag2 import StoragePlugin
 
+from gsfeatloc_ros.common.safe_files import open_regular
+
 _MCAP, _SQLITE, _ZSTD, _ROS1 = b"\x89MCAP0\r\n", b"SQLite format 3\0", b"\x28\xb5\x2f\xfd", b"#ROSBAG V"
 # Of a file of SQLite: header, and where it has the size of a page and their number (sqlite.org/fileformat.html).
 _SQLITE_HEADER = 100
 _PAGE_SIZE, _PAGES = slice(16, 18), slice(28, 32)
 _SUFFIXES = (".mcap", ".db3")
+# A file that was compressed as a whole unpacks to no more than so many times its size, or any to so many bytes; and to
+# no more than this share of the disk that is free.
+_MAX_UNPACKED, _ANY_UNPACKED, _MAX_DISK = 100, 10**9, 0.5
+_BLOCK_BYTES = 1 << 20
 
 
 class BagError(ValueError):
@@ -93,13 +99,10 @@ def in_words(error: Exception) -> str:
 
 
 def _open(path: Path, stack: ExitStack) -> BagFile:
-    file = stack.enter_context(path.open("rb"))
+    file = stack.enter_context(open_regular(path))
     start = file.read(_SQLITE_HEADER)
     if start.startswith(_ZSTD):
-        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        with zstd.open(path, "rb") as compressed, (folder / path.stem).open("wb") as whole:
-            shutil.copyfileobj(compressed, whole)
-        return _open(folder / path.stem, stack)
+        return _open(_unpacked(path, Path(stack.enter_context(tempfile.TemporaryDirectory()))), stack)
     if start.startswith(_ROS1):
         raise BagError(f"{path}: is a bag of ROS 1: convert it with rosbags-convert")
     for magic, is_whole, opened in ((_MCAP, _is_whole_mcap, _McapFile), (_SQLITE, _is_whole_sqlite, _SqliteFile)):
@@ -109,6 +112,23 @@ def _open(path: Path, stack: ExitStack) -> BagFile:
                 raise BagError(f"{path}: was cut short while it was recorded or copied: try ros2 bag reindex")
             return opened(path, file, stack)
     raise BagError(f"{path}: is no file of a rosbag2: neither MCAP nor SQLite")
+
+
+def _unpacked(path: Path, folder: Path) -> Path:
+    """Return a file in a folder with what is in one that was compressed as a whole."""
+    size, free = path.stat().st_size, shutil.disk_usage(folder).free
+    left = min(max(_MAX_UNPACKED * size, _ANY_UNPACKED), int(_MAX_DISK * free))
+    unpacked = folder / path.stem
+    with zstd.open(path, "rb") as compressed, unpacked.open("wb") as whole:
+        while block := compressed.read(_BLOCK_BYTES):
+            left -= len(block)
+            if left < 0:
+                raise BagError(
+                    f"{path}: unpacks to more than {_MAX_UNPACKED} times its size, or than is good for the disk of "
+                    f"{folder.parent} ({1e-9 * free:.1f} GB are free): unpack it with zstd -d"
+                )
+            whole.write(block)
+    return unpacked
 
 
 def _is_whole_mcap(file: IO[bytes], start: bytes) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sqlite3
 
 import numpy as np
@@ -12,6 +13,8 @@ from mcap.writer import Writer as McapWriter
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.typesys import Stores, get_typestore
 
+from gsfeatloc_ros.replay import bag as bag_module
+from gsfeatloc_ros.replay import bag_files
 from gsfeatloc_ros.replay.bag import Role, open_bag
 from gsfeatloc_ros.replay.bag_files import BagError
 
@@ -107,6 +110,38 @@ def test_messages_that_were_compressed_one_by_one(tmp_path):
     kind = {IMAGE: "sensor_msgs/msg/Image"}
     compressed = (IMAGE, ("sensor_msgs/msg/Image", zstd.compress(cdr(5.0))))
     assert stamps(write_messages(tmp_path / "bag", [compressed], topics=kind)) == [5]
+
+
+def test_a_message_that_unpacks_to_too_much_is_reported(tmp_path, monkeypatch):
+    cut_short, whole = (zstd.compress(content) for content in (bytes(10_000_000), cdr(5.0)))
+    monkeypatch.setattr(bag_module, "_MAX_MESSAGE_BYTES", 1_000_000)
+    write_messages(tmp_path / "bag", [(IMAGE, ("sensor_msgs/msg/Image", data)) for data in (cut_short, whole)])
+    with open_bag(tmp_path / "bag", ROLES) as bag:
+        bomb, image_ = bag.messages()
+    assert bomb.message is None
+    assert "unpacks to more than 1 megabytes" in bomb.problem
+    assert image_.message.header.stamp.sec == 5
+
+
+@pytest.mark.parametrize("limit", [("_MAX_UNPACKED", 10), ("_MAX_DISK", 1e-9)])
+def test_a_file_that_unpacks_to_too_much_is_refused(tmp_path, monkeypatch, limit):
+    monkeypatch.setattr(bag_files, "_ANY_UNPACKED", 100_000)
+    monkeypatch.setattr(bag_files, *limit)
+    monkeypatch.setattr(bag_files.tempfile, "tempdir", str(tmp_path))
+    bomb = tmp_path / "bag.mcap.zstd"
+    bomb.write_bytes(zstd.compress(b"\x89MCAP0\r\n" + bytes(10_000_000)))
+    with pytest.raises(BagError, match=r"bag\.mcap\.zstd: unpacks to more than"), open_bag(bomb, ROLES):
+        pass
+    assert list(tmp_path.iterdir()) == [bomb]
+
+
+@pytest.mark.parametrize("name", ["bag.mcap", "bag.db3"])
+def test_a_pipe_is_no_bag_and_is_not_waited_for(tmp_path, name: str):
+    os.mkfifo(tmp_path / name)
+    with pytest.raises(BagError, match="is not a regular file"), open_bag(tmp_path / name, ROLES):
+        pass
+    with pytest.raises(BagError, match="has no"), open_bag(tmp_path, ROLES):
+        pass
 
 
 def test_files_of_a_split_recording_come_in_the_order_of_time(tmp_path):
