@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import threading
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,7 +23,8 @@ from gsfeatloc_ros.localize.settings import MapSettings, MatcherSettings, Render
 from gsfeatloc_ros.maps.ply import write_ply_parts
 from gsfeatloc_ros.render import Renderer, create_renderer
 from gsfeatloc_ros.render.cache import SUFFIX
-from gsfeatloc_ros.simulate.building import ROOM_GAUSSIANS, Building
+from gsfeatloc_ros.render.prepare import prepare
+from gsfeatloc_ros.simulate.building import ROOM_GAUSSIANS, ROOMS_OF_A_STOREY, Building
 
 _CAMERA = pinhole((640, 480))
 # Frames and queries are of so many rooms all over the building, and so many poses in each.
@@ -87,8 +89,8 @@ def print_building(row: dict[str, Any]) -> None:
 
 def _in_a_process(part: Callable[..., Any], *arguments: object) -> Any:
     """Return what a function returns in a process of its own, so that memory is that of nothing else."""
-    with multiprocessing.get_context("spawn").Pool(1) as pool:
-        return pool.apply(part, arguments)
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as process:
+        return process.submit(part, *arguments).result()
 
 
 def _first_start(path: Path) -> dict[str, Any]:
@@ -97,10 +99,13 @@ def _first_start(path: Path) -> dict[str, Any]:
 
 
 def _photos(building: Building, room_gaussians: int, sh_degree: int) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return poses, (4, 4) each, and what is seen there of the one room, exactly: walls hide the others."""
-    photos = []
+    """Return poses, (4, 4) each, and what is seen there of the storey, exactly: doors show more than the one room."""
+    photos, storey = [], -1
     for room in (number * building.rooms // _ROOMS for number in range(_ROOMS)):
-        renderer = create_renderer(building.part(room, room_gaussians, sh_degree), "cpu")
+        if storey != room // ROOMS_OF_A_STOREY:
+            storey = room // ROOMS_OF_A_STOREY
+            seen = building.storey(storey, room_gaussians, sh_degree)
+            renderer = create_renderer(prepare(seen, large=len(seen)), "cpu")
         poses = [building.pose(room, seed) for seed in range(_POSES_OF_A_ROOM)]
         photos += [(pose, renderer.render(_CAMERA, pose).image()) for pose in poses]
     return photos

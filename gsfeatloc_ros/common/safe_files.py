@@ -68,4 +68,5 @@ def _open(path: Path, flags: int) -> BufferedReader:
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
         os.close(descriptor)
         raise OSError("is not a regular file")
-    return os.fdopen(descriptor, "rb")
+    # Other than os.fdopen, so the stream knows its file's name.
+    return open(path, "rb", opener=lambda path, flags: descriptor)

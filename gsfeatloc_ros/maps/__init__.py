@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 import zlib
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from gsfeatloc_ros.maps.assemble import Block, Gather, Layout, T, read_packed
+from gsfeatloc_ros.maps.assemble import Block, Gather, Layout, T, parts, read_packed
 from gsfeatloc_ros.maps.assemble import assemble as to_gaussian_map
 from gsfeatloc_ros.maps.bundle import read_bundle
 from gsfeatloc_ros.maps.files import find_map
@@ -40,6 +40,7 @@ __all__ = [
     "Reading",
     "Similarity",
     "load_map",
+    "look_through",
     "read_dataparser_transforms",
 ]
 
@@ -73,6 +74,32 @@ def load_map(
     gaussian_map = gather_map(path, options, to_gaussian_map)
     check_seen(path, gaussian_map.opacities)
     return gaussian_map if alignment is None else gaussian_map.placed(alignment)
+
+
+def look_through(
+    path: str | Path,
+    look: Callable[[GaussianMap], None],
+    alignment: Similarity | None = None,
+    options: ReadOptions = _DEFAULT_OPTIONS,
+) -> None:
+    """Read a map as `load_map` does, part by part, so that it is never whole in memory.
+
+    Args:
+        path, alignment, options: as for load_map.
+        look: is given each part, which is gone when it returns.
+
+    Raises:
+        MapError: the file cannot be used; parts may have been looked at by then.
+    """
+    bundle = read_bundle(path)
+    if bundle is not None:
+        bundle.check_map()
+
+    def gather(path: Path, layout: Layout, blocks: Iterable[Block], options: ReadOptions) -> None:
+        for part in parts(path, layout, blocks, options):
+            look(part if alignment is None else part.placed(alignment))
+
+    gather_map(Path(path) if bundle is None else bundle.map, options, gather)
 
 
 def gather_map(path: Path, options: ReadOptions, gather: Gather[T]) -> T:

@@ -19,6 +19,8 @@ from gsfeatloc_ros.maps.similarity import Similarity
 SH_C0 = 0.28209479177387814
 # Gaussians taken apart at once: a block of them stays in the CPU's cache. A multiple of compressed .ply's chunk.
 MAX_BLOCK_ROWS = 4096
+# Gaussians that are looked at together where a map is never whole in memory.
+MAX_PART_ROWS = 8 * MAX_BLOCK_ROWS
 # Of SH degree 3 these take 11.8 GB.
 MAX_GAUSSIANS = 50_000_000
 # An .spz of SH degree 3 takes no more for each.
@@ -156,6 +158,27 @@ def empty_map(count: int, sh_coefficients: int) -> GaussianMap:
     )
 
 
+def parts(path: Path, layout: Layout, blocks: Iterable[Block], options: ReadOptions) -> Iterator[GaussianMap]:
+    """Yield a map in parts of at most MAX_PART_ROWS Gaussians; what is in one is gone when the next is asked for.
+
+    Raises:
+        MapError: as `assemble` does, when all parts were there.
+    """
+    intake, room, kept = Intake(path, layout, options), empty_map(MAX_PART_ROWS, layout.sh_coefficients), 0
+
+    def part() -> GaussianMap:
+        filled = {name: getattr(room, name)[:kept] for name in _ARRAYS}
+        return replace(room, **filled, S_map_splat=intake.S_map_splat)
+
+    for block in blocks:
+        if kept + len(block.means) > MAX_PART_ROWS:
+            yield part()
+            kept = 0
+        kept += intake.take(block, room, kept)
+    yield part()
+    intake.described(room)
+
+
 class Intake:
     """Takes the blocks of a map one after another: leaves out what holds no Gaussian, and notes what there is to say.
 
@@ -182,6 +205,11 @@ class Intake:
         self._read, self._kept = self._read + len(valid), self._kept + stored
         return stored
 
+    @property
+    def S_map_splat(self) -> Similarity:
+        """Where the splat frame lies in the file's, as soon as a block was taken."""
+        return Similarity(translation=np.zeros(3) if self._offset is None else self._offset)
+
     def described(self, gaussian_map: GaussianMap) -> GaussianMap:
         """Return a map with what is known of all blocks: where it lies, how it is drawn, what there is to say.
 
@@ -202,7 +230,7 @@ class Intake:
         return replace(
             gaussian_map,
             antialiased=self._antialiased,
-            S_map_splat=Similarity(translation=np.zeros(3) if self._offset is None else self._offset),
+            S_map_splat=self.S_map_splat,
             reading=Reading(tuple(notes), invalid, self._layout.other),
         )
 

@@ -24,6 +24,7 @@ from gsfeatloc_ros.node.publishers import Answer, Publishers
 from gsfeatloc_ros.node.report import Report
 from gsfeatloc_ros.node.standing import StandingPublisher
 from gsfeatloc_ros.node.worker import QueueLimits, Terms, Worker
+from gsfeatloc_ros.render import StaleMapError
 from gsfeatloc_ros.ros_io.extrinsics import Extrinsics
 from gsfeatloc_ros.ros_io.follower import Follower
 from gsfeatloc_ros.ros_io.inputs import LocalizerInput, NewestInputs
@@ -112,12 +113,13 @@ class Attempts:
 
     Attributes:
         publishing: whether answers are published, even those that are for all.
+        stale: whether the map has to be loaded again: its file was changed.
     """
 
     def __init__(self, engine: Engine, follower: Follower, outputs: Outputs) -> None:
         self._engine, self._follower, self._outputs = engine, follower, outputs
         self._engine_lock = Lock()
-        self.publishing = False
+        self.publishing = self.stale = False
         self._worker: Worker[Job, JobResult] = Worker(self._attempt, Job.same)
 
     @property
@@ -176,6 +178,7 @@ class Attempts:
         """Go on with the map of another engine."""
         with self._engine_lock:
             self._engine = engine.with_options(self._engine.options)
+            self.stale = False
 
     def use_options(self, options: LocalizerOptions) -> None:
         """Go on with other options of the localizer."""
@@ -197,6 +200,8 @@ class Attempts:
             result = self._localize(job, interrupted)
         except Interrupted:
             raise
+        except StaleMapError as error:
+            result, self.stale = JobResult(Outcome.refused(error)), True
         except Exception as error:
             # Not foreseen: a bug, or out of memory. The next image may well do.
             result, stack = JobResult(Outcome.error(error)), traceback.format_exc()

@@ -20,8 +20,9 @@ from gsfeatloc_ros.common.words import in_one_line
 from gsfeatloc_ros.localize.engine import load_engine
 from gsfeatloc_ros.node.diagnostics import Reporter
 from gsfeatloc_ros.node.loading import load
-from gsfeatloc_ros.node.map_change import PATH, MapChange
+from gsfeatloc_ros.node.map_change import MapChange
 from gsfeatloc_ros.node.parameters import (
+    PATH,
     check_choices,
     declare_parameters,
     prepare_change,

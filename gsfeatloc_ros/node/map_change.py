@@ -14,10 +14,9 @@ from gsfeatloc_ros.localize.engine import Engine, load_renderer
 from gsfeatloc_ros.localize.settings import MapSettings
 from gsfeatloc_ros.node.diagnostics import ERROR, OK, Reporter
 from gsfeatloc_ros.node.loading import load
+from gsfeatloc_ros.node.parameters import PATH
 from gsfeatloc_ros.node.session import Session
 from gsfeatloc_ros.ros_io.settings import Settings
-
-PATH = "map.path"
 
 
 class MapChange:

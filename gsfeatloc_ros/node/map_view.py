@@ -14,16 +14,17 @@ from std_msgs.msg import Header
 from gsfeatloc_ros.common.threads import Cores
 from gsfeatloc_ros.common.words import in_one_line
 from gsfeatloc_ros.localize.settings import MapSettings
-from gsfeatloc_ros.maps import load_map
-from gsfeatloc_ros.maps.cloud import point_cloud
-from gsfeatloc_ros.maps.occupancy import Slice, occupancy
+from gsfeatloc_ros.maps import GaussianMap, look_through
+from gsfeatloc_ros.maps.cloud import CloudMaker
+from gsfeatloc_ros.maps.occupancy import OccupancyMaker, Slice
 from gsfeatloc_ros.node.diagnostics import Reporter
 from gsfeatloc_ros.node.encode import cloud_message, occupancy_message
 from gsfeatloc_ros.node.qos import LAST, overridable
 
 
 class MapView:
-    """Publishes what the map looks like, once somebody subscribes; the map's file is read again for it.
+    """Publishes what the map looks like, once somebody subscribes; the map's file is read again for it,
+    part by part.
 
     All but the making runs in the executor's thread.
 
@@ -80,13 +81,21 @@ class MapView:
 
     def _publish(self, wanted: list[Publisher], settings: MapSettings) -> None:
         try:
-            gaussian_map = load_map(settings.path, settings.alignment(), settings.reading)
+            cloud, grid = CloudMaker(settings.cloud_points), OccupancyMaker(self._slice)
+
+            def look(part: GaussianMap) -> None:
+                if self._cloud in wanted:
+                    cloud.add(part)
+                if self._occupancy in wanted:
+                    grid.add(part)
+
+            look_through(settings.path, look, settings.alignment(), settings.reading)
             header = Header(stamp=self._node.get_clock().now().to_msg(), frame_id=settings.frame_id)
             for publisher in wanted:
                 if publisher is self._cloud:
-                    message = cloud_message(point_cloud(gaussian_map, settings.cloud_points), header)
+                    message = cloud_message(cloud.cloud(), header)
                 else:
-                    message = occupancy_message(occupancy(gaussian_map, self._slice), header)
+                    message = occupancy_message(grid.grid(), header)
                 # Another map may have come meanwhile, or the end.
                 if publisher in (self._cloud, self._occupancy) and settings.path == self._settings.path:
                     publisher.publish(message)

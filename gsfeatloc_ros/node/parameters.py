@@ -17,6 +17,8 @@ from gsfeatloc_ros.common.words import in_one_line, shortened
 from gsfeatloc_ros.ros_io.old_parameters import RENAMED, RETIRED, notice
 from gsfeatloc_ros.ros_io.settings import PARAMETERS, Settings, nearest_name
 
+# Set, the map is loaded, even if it is the same.
+PATH = "map.path"
 # Of parameters that rclpy declares with the topics.
 _QOS = "qos_overrides."
 

@@ -16,6 +16,7 @@ from gsfeatloc_ros.node.diagnostics import OK, Reporter
 from gsfeatloc_ros.node.graph import GraphWatch
 from gsfeatloc_ros.node.index_build import IndexBuild
 from gsfeatloc_ros.node.map_view import MapView
+from gsfeatloc_ros.node.parameters import PATH
 from gsfeatloc_ros.node.pose_file import PoseFile
 from gsfeatloc_ros.node.publishers import Publishers
 from gsfeatloc_ros.node.reception import Reception
@@ -209,7 +210,15 @@ class Session:
             sigma = self.settings.recovery.state.lost_distance
             self.inputs.start_from(self.settings.prior_policy().saved(pose, sigma))
 
+    def _reload_stale_map(self) -> None:
+        """Have the map loaded again where the file of its Gaussians was changed while in use."""
+        if self.attempts.stale:
+            # Once for each image that is refused for it: where it cannot be loaded now, it is tried again.
+            self.attempts.stale = False
+            self._node.set_parameters([self._node.get_parameter(PATH)])
+
     def _report_health(self) -> None:
+        self._reload_stale_map()
         mode, last = self.settings.node.mode, self._publishers.last_stamp
         if self.active:
             self._follower.pass_time(mode == CONTINUOUS)

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 from gsfeatloc_ros.common.device import DEVICES, choose_device, device_without
 from gsfeatloc_ros.common.threads import wait_passively
 from gsfeatloc_ros.maps.gaussian_map import GaussianMap
-from gsfeatloc_ros.render.base import DEFAULT_DRAW_OPTIONS, DrawOptions, Render, Renderer, SplatRenderer
+from gsfeatloc_ros.render.base import DEFAULT_DRAW_OPTIONS, DrawOptions, Render, Renderer, SplatRenderer, StaleMapError
 
 if TYPE_CHECKING:
     from gsfeatloc_ros.render.chunks import PreparedMap
 
-__all__ = ["DEVICES", "DrawOptions", "Render", "Renderer", "SplatRenderer", "create_renderer"]
+__all__ = ["DEVICES", "DrawOptions", "Render", "Renderer", "SplatRenderer", "StaleMapError", "create_renderer"]
 
 
 def create_renderer(

@@ -105,6 +105,10 @@ class Render:
         )
 
 
+class StaleMapError(RuntimeError):
+    """The file of a large map was changed while it was in use, or cannot be read: the map has to be loaded again."""
+
+
 class Renderer(Protocol):
     """Draws a map. Implementations are safe to call from any thread and release the GIL.
 
@@ -126,7 +130,11 @@ class Renderer(Protocol):
         ...
 
     def render(self, camera: Camera, T_map_camera: np.ndarray) -> Render:
-        """Draw what `camera` (its distortion ignored) sees from the pose `T_map_camera` (4, 4)."""
+        """Draw what `camera` (its distortion ignored) sees from the pose `T_map_camera` (4, 4).
+
+        Raises:
+            StaleMapError: it cannot be read any more.
+        """
         ...
 
 

@@ -72,7 +72,9 @@ def _prepared(path: Path, options: ReadOptions, cache_path: Path, origin: dict[s
             with replaced_file(cache_path) as stream:
                 prepare_in_file(found, stream, origin, cache_path.parent)
         except OSError as error:
-            _log.warning("%s: cannot be written (%s): the map is prepared in memory", cache_path, error.strerror)
+            _log.warning(
+                "%s: cannot be written (%s): the map is prepared in memory", cache_path, error.strerror or error
+            )
         else:
             prepared = _read_if_usable(cache_path, origin)
             if prepared is not None:
@@ -102,7 +104,7 @@ def _write_if_possible(path: Path, prepared: PreparedMap, origin: dict[str, Any]
         with replaced_file(path) as stream:
             write(stream, prepared, origin)
     except OSError as error:
-        _log.debug("%s: cannot be written: %s", path, error.strerror)
+        _log.debug("%s: cannot be written: %s", path, error.strerror or error)
 
 
 def map_content(path: str | Path) -> list[Any]:

@@ -1,4 +1,4 @@
-"""Prepared maps in files: written once, read or, where they are large, mapped into memory.
+"""Prepared maps in files: written once, then read, the Gaussians of large ones as they are needed.
 
 A file is a line of text; the header's length, the CRC-32 of the header and those of the arrays (4 bytes each,
 little-endian); the header (JSON, filled up with spaces to the end of a page); and the arrays one after another. Only
@@ -9,10 +9,9 @@ from __future__ import annotations
 
 import json
 import math
-import mmap
 import os
 import zlib
-from collections.abc import Iterator
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, BinaryIO
 
@@ -31,6 +30,7 @@ from gsfeatloc_ros.render.chunks import (
     PreparedMap,
     level_starts,
 )
+from gsfeatloc_ros.render.stored import StoredArray, StoredFile
 
 MAGIC = b"gsfeatloc_ros prepared map 3\n"
 ARRAYS = ("gaussians", "sh", "low", "high", "sizes")
@@ -38,14 +38,14 @@ _CHECKSUMS = 1 + len(ARRAYS)
 # Gaussians of a map of 1 TB; more chunks are a lie.
 _MAX_CHUNKS = 2**32 // CHUNK
 _MAX_HEADER_BYTES = 64 * 1024
-# Arrays begin with one: kernels read whole lines of the CPU's cache.
+# Arrays begin with one.
 _PAGE = 4096
 # Of an array that is looked at, at a time.
 _BLOCK_BYTES = 1 << 24
 # All ones in a half: infinite, or no number.
 _HALF_EXPONENT = np.uint16(0x7C00)
-# Pages that are never written take none of the memory that is promised. Python's module has it from 3.13 on.
-_MAP_NORESERVE = 0x4000
+# Of a large map these stay in the file.
+_STORED = ("gaussians", "sh")
 
 
 class CacheError(Exception):
@@ -115,7 +115,7 @@ class Header:
         """Return the bytes of all arrays."""
         return sum(_size(*array) for array in self.layout().values())
 
-    def prepared(self, arrays: dict[str, np.ndarray]) -> PreparedMap:
+    def prepared(self, arrays: Mapping[str, Any]) -> PreparedMap:
         """Return the map of these arrays."""
         return PreparedMap(
             **arrays,
@@ -130,12 +130,12 @@ def write(stream: BinaryIO, prepared: PreparedMap, origin: dict[str, Any]) -> No
     """Write a map to a file that can be read as well; raise OSError where that fails."""
     copy = create(stream, Header.of(prepared), origin)
     for name in ARRAYS:
-        getattr(copy, name)[...] = getattr(prepared, name)
+        getattr(copy, name)[:] = getattr(prepared, name)[:]
     seal(stream, copy)
 
 
 def create(stream: BinaryIO, header: Header, origin: dict[str, Any]) -> PreparedMap:
-    """Return a map whose arrays, all zeros, are those of a file; what is written to them is in it once it is sealed.
+    """Return a map, all zeros, whose Gaussians are in a file; it is whole once it is sealed.
 
     Raises:
         OSError: there is no room for it.
@@ -149,25 +149,34 @@ def create(stream: BinaryIO, header: Header, origin: dict[str, Any]) -> Prepared
     stream.write(bytes(4 * len(ARRAYS)))
     stream.write(encoded)
     stream.flush()
-    start, size = fixed + len(encoded), header.size()
-    if size:
-        # Now, not when a page is written: that would end the process.
-        os.posix_fallocate(stream.fileno(), start, size)
-    return _map(stream, header, start, mmap.MAP_SHARED)
+    if header.size():
+        # Now, not after minutes of work.
+        os.posix_fallocate(stream.fileno(), fixed + len(encoded), header.size())
+    arrays = _arrays(stream, header, fixed + len(encoded))
+    small = {name: np.zeros(array.shape, array.dtype) for name, array in arrays.items() if name not in _STORED}
+    return header.prepared(arrays | small)
 
 
 def seal(stream: BinaryIO, prepared: PreparedMap) -> None:
-    """Write the checksums of a map that `create` made in a file."""
+    """Write what is left of a map that `create` made in a file: its small arrays, and the checksums."""
+    header = Header.of(prepared)
+    checksums = b""
+    for name, array in _arrays(stream, header, os.fstat(stream.fileno()).st_size - header.size()).items():
+        if name not in _STORED:
+            array[:] = getattr(prepared, name)
+        checksum = 0
+        for block in array.blocks(_BLOCK_BYTES):
+            checksum = zlib.crc32(block.data, checksum)
+        checksums += checksum.to_bytes(4, "little")
     stream.seek(len(MAGIC) + 8)
-    for name in ARRAYS:
-        stream.write(zlib.crc32(getattr(prepared, name).data).to_bytes(4, "little"))
+    stream.write(checksums)
 
 
 def read(stream: BinaryIO, origin: dict[str, Any], large: int = LARGE_MAP) -> PreparedMap | None:
-    """Read a map; one of more than `large` Gaussians is mapped into memory.
+    """Read a map; of one of more than `large` Gaussians these stay in the file.
 
-    What of such a map a view needs comes from the disk, or from what the system keeps of the file while there is memory
-    to spare; several processes share that. The file must not be changed, only replaced.
+    All of it is looked at once. What a view needs then comes from the disk, or from what the system keeps of the file
+    while there is memory to spare; several processes share that. The file must not be changed, only replaced.
 
     Returns:
         The map; None where the file is of another `origin`.
@@ -176,6 +185,7 @@ def read(stream: BinaryIO, origin: dict[str, Any], large: int = LARGE_MAP) -> Pr
         CacheError: it is no prepared map, or a damaged one.
         OSError: it cannot be read.
     """
+    status = os.fstat(stream.fileno())
     if stream.read(len(MAGIC)) != MAGIC:
         raise CacheError("is no prepared map of this version")
     length, *checksums = (int.from_bytes(stream.read(4), "little") for _ in range(1 + _CHECKSUMS))
@@ -189,26 +199,23 @@ def read(stream: BinaryIO, origin: dict[str, Any], large: int = LARGE_MAP) -> Pr
         header = Header.parse(values["map"])
     except (KeyError, TypeError, ValueError, RecursionError) as error:
         raise CacheError("is damaged") from error
-    start, layout = stream.tell(), header.layout()
-    if header.size() != os.fstat(stream.fileno()).st_size - start:
+    start, is_large = stream.tell(), header.leaves * CHUNK > large
+    if header.size() != status.st_size - start:
         raise CacheError("is truncated")
-    if zlib.crc32(encoded) != checksums[0]:
+    # One that large without coarser levels would be drawn from more chunks than there is memory for.
+    if zlib.crc32(encoded) != checksums[0] or (is_large and not header.coarser):
         raise CacheError("is damaged")
-    is_large = header.leaves * CHUNK > large
-    arrays = {}
-    for (name, (dtype, shape)), checksum in zip(layout.items(), checksums[1:], strict=True):
-        blocks = _blocks(shape, _BLOCK_BYTES // _size(dtype, shape[1:]) if is_large else shape[0])
+    arrays: dict[str, np.ndarray | StoredArray] = {}
+    for (name, array), checksum in zip(_arrays(stream, header, start, status).items(), checksums[1:], strict=True):
+        stays = is_large and name in _STORED
         found = 0
-        for block_shape in blocks:
-            array = np.fromfile(stream, dtype, math.prod(block_shape)).reshape(block_shape)
-            found = zlib.crc32(array.data, found)
-            if not _is_possible(name, array):
+        for block in array.blocks(_BLOCK_BYTES if stays else header.size()):
+            found = zlib.crc32(block.data, found)
+            if not _is_possible(name, block):
                 raise CacheError("is damaged")
-            arrays[name] = array
+            arrays[name] = array if stays else block
         if found != checksum:
             raise CacheError("is damaged")
-    if is_large:
-        return _map(stream, header, start, mmap.MAP_PRIVATE | _MAP_NORESERVE)
     return header.prepared(arrays)
 
 
@@ -217,24 +224,15 @@ def _size(dtype: str, shape: tuple[int, ...]) -> int:
     return np.dtype(dtype).itemsize * math.prod(shape)
 
 
-def _blocks(shape: tuple[int, ...], rows: int) -> Iterator[tuple[int, ...]]:
-    """Yield the shapes of parts of so many rows that together have a shape."""
-    for first in range(0, max(shape[0], 1), max(rows, 1)):
-        yield (min(rows, shape[0] - first), *shape[1:])
-
-
-def _map(stream: BinaryIO, header: Header, start: int, flags: int) -> PreparedMap:
-    """Return the map whose arrays are in a file from `start` on.
-
-    They can be written to, as kernels are compiled for such arrays; whether that changes the file the flags say.
-    """
-    layout = header.layout()
-    memory = mmap.mmap(stream.fileno(), start + header.size(), flags=flags, prot=mmap.PROT_READ | mmap.PROT_WRITE)
-    arrays = {}
-    for name, (dtype, shape) in layout.items():
-        arrays[name] = np.frombuffer(memory, dtype, math.prod(shape), start).reshape(shape)
+def _arrays(
+    stream: BinaryIO, header: Header, start: int, status: os.stat_result | None = None
+) -> dict[str, StoredArray]:
+    """Return the ARRAYS that are in a file from `start` on; `status` as for StoredFile."""
+    file, arrays = StoredFile(stream, status), {}
+    for name, (dtype, shape) in header.layout().items():
+        arrays[name] = StoredArray(file, start, dtype, shape)
         start += _size(dtype, shape)
-    return header.prepared(arrays)
+    return arrays
 
 
 def _is_possible(name: str, array: np.ndarray) -> bool:

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import threading
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from gsfeatloc_ros.maps.gaussian_map import SH_COEFFICIENTS, Reading, sample_solid
 from gsfeatloc_ros.maps.similarity import Similarity
+
+if TYPE_CHECKING:
+    from gsfeatloc_ros.render.stored import StoredArray
 
 # Held while kernels run in parallel: numba's fallback threading layer does not take calls from two threads at once.
 KERNEL_LOCK = threading.Lock()
@@ -19,6 +23,8 @@ CHUNK = 256
 ROWS = 10
 # A map of more Gaussians than this gets coarser levels, and stays on disk; one of as many is drawn exactly.
 LARGE_MAP = 1 << 20
+# A view of such a map is drawn from no more chunks, 786 432 Gaussians: memory and time have this bound.
+MAX_CHUNKS = 3072
 # Most that a merged Gaussian is opaque: where there are more layers of them, more is not seen.
 MAX_LOG2_OPACITY = 2.0
 # Chunks of a level, neighbours, that one of the next coarser level stands for.
@@ -47,7 +53,8 @@ class PreparedMap:
     for some of the level before (render/levels.py).
 
     Attributes:
-        gaussians: (chunks, ROWS, CHUNK) float32, splat frame; merged ones may be more than opaque.
+        gaussians: (chunks, ROWS, CHUNK) float32, splat frame; merged ones may be more than opaque. Of a large map they,
+            and `sh`, may stay in a file.
         sh: (chunks, 3 C, CHUNK) float16, row 3 k + channel is harmonic k; half precision costs less than the rounding
             to 8-bit colours by far, and halves what a map takes.
         low, high: (chunks, 3) float32, splat frame, the box outside which no Gaussian of the chunk, nor one that it
@@ -58,8 +65,8 @@ class PreparedMap:
         antialiased, S_map_splat, reading: as in GaussianMap.
     """
 
-    gaussians: np.ndarray
-    sh: np.ndarray
+    gaussians: np.ndarray | StoredArray
+    sh: np.ndarray | StoredArray
     low: np.ndarray
     high: np.ndarray
     sizes: np.ndarray
@@ -99,7 +106,7 @@ class PreparedMap:
         rows = self.gaussians[: self.leaves].transpose(0, 2, 1).reshape(-1, ROWS)
         # Those that fill up the last chunk have no opacity.
         count = np.count_nonzero(np.isfinite(rows[:, LOG2_OPACITY]))
-        sh = self.sh[: self.leaves, : 3 * used].transpose(0, 2, 1).reshape(-1, used, 3)
+        sh = self.sh[: self.leaves][:, : 3 * used].transpose(0, 2, 1).reshape(-1, used, 3)
         return UnpackedGaussians(
             means=np.ascontiguousarray(rows[:count, MEAN_X : MEAN_Z + 1]),
             covariances=np.ascontiguousarray(rows[:count, COV_XX : COV_ZZ + 1]),

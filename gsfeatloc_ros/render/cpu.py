@@ -18,6 +18,7 @@ from gsfeatloc_ros.render.cut import Cut
 from gsfeatloc_ros.render.enlarge import draw_scaled
 from gsfeatloc_ros.render.prepare import prepare
 from gsfeatloc_ros.render.project import SPLAT_SIZE, TILE, project
+from gsfeatloc_ros.render.stored import Resident
 
 _MAX_THREADS = 1024
 
@@ -48,8 +49,9 @@ class CpuRenderer(SplatRenderer):
         self._resolution_scale = options.resolution_scale
         self._antialiased = prepared.antialiased
         self._cut = Cut(prepared)
-        self._gaussians = prepared.gaussians.reshape(-1)
-        self._sh = prepared.sh.view(np.int16).reshape(-1)
+        self._resident = Resident(prepared)
+        self._gaussians = self._resident.gaussians.reshape(-1)
+        self._sh = self._resident.sh.view(np.int16).reshape(-1)
         stored = prepared.sh_coefficients
         self._harmonics = (stored, min(stored, SH_COEFFICIENTS[options.sh_degree]))
         self._splats = np.empty(0, dtype=np.float32)
@@ -67,6 +69,8 @@ class CpuRenderer(SplatRenderer):
         view = camera_view(camera, T_splat_camera)
         with stage("cull"):
             chunks = self._cut.chunks(view)
+        with stage("read"):
+            slots = self._resident.slots(chunks)
         if len(self._splats) < len(chunks) * CHUNK * SPLAT_SIZE:
             self._splats = np.empty(len(chunks) * CHUNK * SPLAT_SIZE, dtype=np.float32)
         tiles = -(-camera.width // TILE) * -(-camera.height // TILE)
@@ -74,7 +78,7 @@ class CpuRenderer(SplatRenderer):
         while True:
             with stage("project"):
                 pairs = project(
-                    chunks,
+                    slots,
                     self._gaussians,
                     self._sh,
                     self._harmonics,

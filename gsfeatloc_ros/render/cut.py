@@ -11,13 +11,12 @@ import numpy as np
 from gsfeatloc_ros.common.kernels import njit
 from gsfeatloc_ros.render.base import NEAR_PLANE
 from gsfeatloc_ros.render.camera_view import CameraView, frustum, is_outside, visible_chunks
-from gsfeatloc_ros.render.chunks import BRANCHING, CHUNK, LARGE_MAP, PreparedMap
+from gsfeatloc_ros.render.chunks import BRANCHING, MAX_CHUNKS, PreparedMap
 from gsfeatloc_ros.render.levels import MAX_SIZE
 
-# A view of a large map is drawn from no more chunks, a million Gaussians: memory and time have this bound. Where it
-# would see more, merged Gaussians may be larger by such steps, until it does not.
-MAX_CHUNKS = LARGE_MAP // CHUNK
-_LARGER, _STEPS = math.sqrt(2.0), 40
+# Where a view would be drawn from more than MAX_CHUNKS, merged Gaussians may be larger the farther they are beyond some
+# depth: what stands near hides much of what lies behind. That depth is found by so many halvings between these.
+_HALVINGS, _LEAST, _FARTHEST = 8, 1e-3 * NEAR_PLANE, 1e12
 # More than a path from the coarsest level to the finest leaves undone on its way.
 _STACK_SIZE = 128
 
@@ -39,24 +38,41 @@ class Cut:
         """Return the indices (n,) int64 of the chunks that `view` is drawn from, in the order of the leaves.
 
         Of a map of one level they are those that it may see. Of others, a chunk takes the place of the leaves that it
-        stands for where its Gaussians are seen no larger than MAX_SIZE pixels, the nearest of them as well; where those
-        are too many chunks, where they are seen no larger than is needed for fewer.
+        stands for where its Gaussians are seen no larger than MAX_SIZE pixels, the nearest of them as well. Where those
+        are too many chunks, this holds up to some depth only, and behind it for what is (depth / that)^2 as large.
         """
         if len(self._starts) == 2:
             return visible_chunks(view, self._low, self._high)
-        scale, sides = float(max(view.fx, view.fy)) / MAX_SIZE, frustum(view)
-        boxes = (self._low, self._high, self._sizes, self._starts)
+        sides = frustum(view)
+
+        def cut(scale: float, reach: float) -> np.ndarray:
+            boxes = (self._low, self._high, self._sizes, self._starts)
+            return _cut(*boxes, view.origin, view.forward, scale, reach, *sides, self._max_chunks)
+
+        scale = float(max(view.fx, view.fy)) / MAX_SIZE
+        chunks = cut(scale, math.inf)
+        if len(chunks) <= self._max_chunks:
+            return chunks
+        # Of the whole map; it may be infinite.
+        size = float(np.abs(np.stack([self._low[-1], self._high[-1]]) - view.origin).sum())
+        least, most = math.log(_LEAST), math.log(max(min(_FARTHEST, size), _LEAST))
+        for _ in range(_HALVINGS):
+            reach = 0.5 * (least + most)
+            fewer = cut(scale, math.exp(reach))
+            if len(fewer) <= self._max_chunks:
+                chunks, least = fewer, reach
+            else:
+                most = reach
         # At last any size will do: a merged Gaussian may be infinite.
-        for scale in (*(scale / _LARGER**step for step in range(_STEPS)), 0.0):
-            chunks = _cut(*boxes, view.origin, view.forward, scale, *sides, self._max_chunks)
-            if len(chunks) <= self._max_chunks:
-                break
-        return chunks
+        return chunks if len(chunks) <= self._max_chunks else cut(0.0, math.inf)
 
 
 @njit(nogil=True, cache=True)
-def _cut(low, high, sizes, starts, origin, forward, scale, inward, margins, limits, max_chunks):
-    """Return the chunks, or more than `max_chunks` of them; `scale` is the focal length in the largest size allowed."""
+def _cut(low, high, sizes, starts, origin, forward, scale, reach, inward, margins, limits, max_chunks):
+    """Return the chunks, or more than `max_chunks` of them.
+
+    `scale` is the focal length in the largest size allowed, `reach` the depth from which on larger ones are.
+    """
     levels = len(starts) - 1
     chunks = np.empty(starts[1], dtype=np.int64)
     count = 0
@@ -70,7 +86,7 @@ def _cut(low, high, sizes, starts, origin, forward, scale, inward, margins, limi
             continue
         # Nothing before the near plane is drawn.
         depth = max(_least_depth(low[chunk], high[chunk], origin, forward), NEAR_PLANE)
-        if level == 0 or scale == 0.0 or scale * sizes[chunk] <= depth:
+        if level == 0 or scale == 0.0 or scale * sizes[chunk] <= depth * max(depth / reach, 1.0) ** 2:
             chunks[count] = chunk
             count += 1
             continue

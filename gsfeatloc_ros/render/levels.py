@@ -57,49 +57,54 @@ def merge_levels(prepared: PreparedMap) -> None:
     starts = prepared.level_starts
     for level in range(1, len(starts) - 1):
         for begin in range(starts[level], starts[level + 1], _AT_ONCE):
+            made = slice(begin, min(begin + _AT_ONCE, starts[level + 1]))
+            first = starts[level - 1] + (begin - starts[level]) * BRANCHING
+            children = slice(first, min(first + BRANCHING * _AT_ONCE, starts[level]))
+            # Of a map in a file they are copies.
+            gaussians, sh = prepared.gaussians[made], prepared.sh[made]
             with KERNEL_LOCK:
                 _merge(
-                    (starts[level - 1], starts[level]),
-                    (begin, min(begin + _AT_ONCE, starts[level + 1])),
-                    prepared.gaussians,
-                    prepared.sh.view(np.int16),
-                    prepared.low,
-                    prepared.high,
-                    prepared.sizes,
+                    prepared.gaussians[children],
+                    prepared.sh[children].view(np.int16),
+                    (prepared.low[children], prepared.high[children]),
+                    gaussians,
+                    sh.view(np.int16),
+                    (prepared.low[made], prepared.high[made]),
+                    prepared.sizes[made],
                     0.0 if prepared.antialiased else EPS2D / _USUAL_SIZE**2,
                     _HALVES,
                 )
+            prepared.gaussians[made], prepared.sh[made] = gaussians, sh
 
 
 @njit(parallel=True, nogil=True, cache=True)
-def _merge(levels, chunks, gaussians, sh_bits, low, high, sizes, blur, halves):
+def _merge(children, children_sh, children_boxes, gaussians, sh_bits, boxes, sizes, blur, halves):
     """Make chunks of those of the level before.
 
     Args:
-        levels: where the level before and this one begin.
-        chunks: the first that is made, and the one behind the last.
-        gaussians, low, high, sizes: PreparedMap's.
-        sh_bits: PreparedMap.sh, as int16.
+        children, children_sh: gaussians, and sh as int16, of the chunks that they are made of, BRANCHING each.
+        children_boxes: their low and high.
+        gaussians, sh_bits, sizes: of those that are made; written.
+        boxes: their low and high; written.
         blur: variance of the blur where merged Gaussians are drawn, in squares of their size.
         halves: _HALVES.
     """
-    children, first = levels
-    for chunk in prange(chunks[0], chunks[1]):
-        begin = children + (chunk - first) * BRANCHING
-        places, means = _gathered(begin, min(begin + BRANCHING, first), gaussians)
+    for chunk in prange(len(gaussians)):
+        begin, end = chunk * BRANCHING, min((chunk + 1) * BRANCHING, len(children))
+        places, means = _gathered(begin, end, children)
         groups = -(-len(places) // BRANCHING)
         _group(means, places, groups)
-        size = _size(means, places, groups, gaussians)
-        _fill(chunk, means, places, groups, gaussians, sh_bits, blur * size * size, halves)
+        size = _size(means, places, groups, children)
+        made = gaussians[chunk], sh_bits[chunk]
+        _fill(*made, means, places, groups, children, children_sh, blur * size * size, halves)
         sizes[chunk] = size
+        low, high = boxes[0][chunk], boxes[1][chunk]
         for axis in range(3):
-            lowest, highest = np.inf, -np.inf
-            for child in range(begin, min(begin + BRANCHING, first)):
-                lowest, highest = min(lowest, low[child, axis]), max(highest, high[child, axis])
-            low[chunk, axis], high[chunk, axis] = lowest, highest
+            low[axis] = children_boxes[0][begin:end, axis].min()
+            high[axis] = children_boxes[1][begin:end, axis].max()
         for slot in range(groups):
             deviations = math.sqrt(2 * (gaussians[chunk, LOG2_OPACITY, slot] - _LOG2_OPACITIES[0]) * math.log(2.0))
-            grow_box(gaussians[chunk], slot, deviations, low[chunk], high[chunk])
+            grow_box(gaussians[chunk], slot, deviations, low, high)
 
 
 @njit
@@ -214,12 +219,11 @@ def _log2_opacity_of(mass):
 
 
 @njit
-def _fill(chunk, means, places, groups, gaussians, sh_bits, blur, halves):
+def _fill(merged, merged_sh, means, places, groups, gaussians, sh_bits, blur, halves):
     """Write the merged Gaussians of all groups to a chunk, and fill it up. `blur` is a variance, splat units."""
-    merged = gaussians[chunk]
     merged[:] = 0.0
     merged[LOG2_OPACITY] = -np.inf
-    sh_bits[chunk] = 0
+    merged_sh[:] = 0
     weights = np.empty(2 * BRANCHING)
     cov = np.empty(6)
     mean = np.empty(3)
@@ -258,4 +262,4 @@ def _fill(chunk, means, places, groups, gaussians, sh_bits, blur, halves):
             value = 0.0
             for i in range(begin, end):
                 value += weights[i - begin] / total * halves[np.uint16(sh_bits[places[i, 0], k, places[i, 1]])]
-            sh_bits[chunk, k, group] = half_bits(np.float32(value))
+            merged_sh[k, group] = half_bits(np.float32(value))

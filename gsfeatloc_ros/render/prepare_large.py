@@ -178,16 +178,11 @@ class _Buckets:
             end = chunk + -(-full // CHUNK)
             columns = (slice(0, 3), slice(3, 6), slice(6, 10), 10, slice(_COLUMNS, None))
             means, scales, *others = (np.ascontiguousarray(rows[:, column]) for column in columns)
+            gaussians = np.empty((end - chunk, *prepared.gaussians.shape[1:]), np.float32)
+            sh = np.empty((end - chunk, *prepared.sh.shape[1:]), np.float16)
+            boxes = prepared.low[chunk:end], prepared.high[chunk:end]
             with KERNEL_LOCK:
                 order = drawing_order(means, scales, self._found.grid, np.arange(len(rows), dtype=np.uint64))
-                fill_chunks(
-                    order[:full],
-                    means,
-                    scales,
-                    *others,
-                    prepared.gaussians[chunk:end],
-                    prepared.sh[chunk:end].view(np.int16),
-                    prepared.low[chunk:end],
-                    prepared.high[chunk:end],
-                )
+                fill_chunks(order[:full], means, scales, *others, gaussians, sh.view(np.int16), *boxes)
+            prepared.gaussians[chunk:end], prepared.sh[chunk:end] = gaussians, sh
             left, chunk = rows[order[full:]], end

@@ -65,9 +65,9 @@ def project(chunks, gaussians, sh, harmonics, antialiased, view, splats, pair_ti
     map order. A segment too small is left incomplete.
 
     Args:
-        chunks: (n,) int64 from `visible_chunks`.
-        gaussians: PreparedMap.gaussians, flat.
-        sh: PreparedMap.sh, flat, as int16.
+        chunks: (n,) int64, where they are in `gaussians` and `sh`, from `Resident.slots`.
+        gaussians: Resident.gaussians, flat.
+        sh: Resident.sh, flat, as int16.
         harmonics: (stored, used) harmonics per channel.
         antialiased: dim each Gaussian as much as the blur widens it (Yu et al., "Mip-Splatting", 2024, eq. 9).
         view: the camera.

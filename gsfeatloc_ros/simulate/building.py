@@ -12,7 +12,7 @@ from gsfeatloc_ros.simulate.boxes import cover_boxes, looking_at
 # As many as in half of two_rooms' map of a million.
 ROOM_GAUSSIANS = 500_000
 # Rooms of a storey lie on both sides of a corridor.
-_ROOMS_OF_A_STOREY = 10
+ROOMS_OF_A_STOREY = 10
 _ROOM, _CORRIDOR, _STOREY = np.array([5.0, 4.0, 2.7]), np.array([5.0, 1.0, 2.7]), 3.0
 # Of the corridor, along y.
 _MIDDLE = _ROOM[1] + _CORRIDOR[1]
@@ -53,6 +53,13 @@ class Building:
         doors = np.array([along, across, self._door(room, corner)])
         return cover_boxes(np.array(boxes), doors, gaussians, rng, sh_degree)
 
+    def storey(self, number: int, gaussians: int = ROOM_GAUSSIANS, sh_degree: int = 0) -> GaussianMap:
+        """Return all rooms of a storey, so many Gaussians each, as one map."""
+        rooms = range(number * ROOMS_OF_A_STOREY, min((number + 1) * ROOMS_OF_A_STOREY, self.rooms))
+        parts = [self.part(room, gaussians, sh_degree) for room in rooms]
+        arrays = ("means", "scales", "rotations", "opacities", "sh")
+        return GaussianMap(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in arrays})
+
     def pose(self, room: int, seed: int) -> np.ndarray:
         """Return a pose (4, 4) T_map_camera of a camera in a room that looks across it."""
         rng = np.random.default_rng([self._seed, room, seed])
@@ -68,7 +75,7 @@ class Building:
 
     def _corners(self, room: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the lowest corners (3,) of a room and of its part of the corridor."""
-        storey, place = divmod(room, _ROOMS_OF_A_STOREY)
+        storey, place = divmod(room, ROOMS_OF_A_STOREY)
         x, z = place // 2 * _ROOM[0], storey * _STOREY
         if place % 2:
             return np.array([x, _ROOM[1] + 2 * _CORRIDOR[1], z]), np.array([x, _MIDDLE, z])

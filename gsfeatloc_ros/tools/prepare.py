@@ -32,7 +32,7 @@ from gsfeatloc_ros.inspect.page import as_page
 from gsfeatloc_ros.localize.engine import load_renderer
 from gsfeatloc_ros.localize.map_index import index_key, load_or_make
 from gsfeatloc_ros.localize.settings import MapSettings, RendererSettings
-from gsfeatloc_ros.maps import MapError, load_map
+from gsfeatloc_ros.maps import MapError, look_through
 from gsfeatloc_ros.maps.bundle import ALIGNMENT, INSPECTION, MAP_FOLDER, Bundle, map_in, read_bundle
 from gsfeatloc_ros.maps.files import content_of, find_map, map_files
 from gsfeatloc_ros.render.cache import SUFFIX
@@ -60,7 +60,7 @@ def _prepare(options: argparse.Namespace) -> int:
     poses = training_poses(options, given.alignment())
     old = read_bundle(options.out)
     if old is None:
-        load_map(given.path, options=given.reading)  # what is no map is not copied
+        look_through(given.path, lambda part: None, options=given.reading)  # what is no map is not copied
     bundle, sources = _plan(options, given)
     _copy(bundle, sources)
     map_ = replace(MapSettings(str(bundle.folder)).resolved(), cache=True)

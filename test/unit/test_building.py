@@ -38,6 +38,14 @@ def test_parts_written_one_after_another_are_one_map(tmp_path) -> None:
     np.testing.assert_allclose(read.opacities, np.concatenate([part.opacities for part in parts]), atol=1e-6)
 
 
+def test_a_storey_is_its_rooms() -> None:
+    building = Building(12)
+    storey = building.storey(1, 500)
+    np.testing.assert_array_equal(storey.means[500:], building.part(11, 500).means)
+    assert len(storey) == 1000
+    assert len(building.storey(0, 500)) == 5000
+
+
 def test_cameras_in_a_room_see_its_walls() -> None:
     building = Building(1)
     renderer = create_renderer(building.part(0, 20_000), "cpu")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import mmap
 import os
 import stat
 import zlib
@@ -17,15 +16,17 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from small_maps import small_camera
 
 from gsfeatloc_ros.common.geometry import so3_exp
 from gsfeatloc_ros.maps import MapError, Similarity, load_map
 from gsfeatloc_ros.maps.ply import write_ply
-from gsfeatloc_ros.render import cache, cache_file, prepare_large
+from gsfeatloc_ros.render import StaleMapError, cache, cache_file, create_renderer, prepare_large, stored
 from gsfeatloc_ros.render.cache import load_prepared
 from gsfeatloc_ros.render.chunks import LOG2_OPACITY, MEAN_X, PreparedMap
 from gsfeatloc_ros.render.prepare import prepare
-from gsfeatloc_ros.simulate.two_rooms import two_rooms
+from gsfeatloc_ros.render.stored import Resident, StoredArray
+from gsfeatloc_ros.simulate.two_rooms import VIEWS, two_rooms
 
 # Where it begins: behind a line of text, its length and the checksums.
 HEADER = len(cache_file.MAGIC) + 4 * (2 + len(cache_file.ARRAYS))
@@ -58,7 +59,7 @@ def cache_of(map_path: Path) -> Path:
 
 def assert_same(one: PreparedMap, other: PreparedMap) -> None:
     for name in ARRAYS:
-        a, b = getattr(one, name), getattr(other, name)
+        a, b = getattr(one, name)[:], getattr(other, name)[:]
         assert (a.dtype, a.shape) == (b.dtype, b.shape)
         # The bits: of what fills up the last chunk some may be NaN.
         assert a.tobytes() == b.tobytes()
@@ -246,7 +247,7 @@ def test_shapes_that_the_arrays_cannot_have_are_refused_before_memory_is_taken(m
     load_prepared(map_file)
     forged(map_file, **lie)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(cache_file.np, "fromfile", lambda *arguments: pytest.fail("memory is taken"))
+        patch.setattr(stored.np, "empty", lambda *arguments: pytest.fail("memory is taken"))
         with cache_of(map_file).open("rb") as stream, pytest.raises(cache_file.CacheError, match=says):
             cache_file.read(stream, cache_origin(map_file))
     load_prepared(map_file)
@@ -302,23 +303,77 @@ def test_a_cache_that_others_can_have_written_is_not_believed(map_file, caplog, 
     assert stat.S_IMODE(cache_of(map_file).lstat().st_mode) == 0o644
 
 
-def test_a_large_map_is_mapped_and_the_file_is_not_written_to(map_file):
-    prepared = prepare(load_map(map_file), large=100)
+def large_from_file(map_path: Path) -> PreparedMap:
+    """The map, as if it were a large one, from its cache: its Gaussians stay there."""
+    with cache_of(map_path).open("w+b") as stream:
+        cache_file.write(stream, prepare(load_map(map_path), large=100), {})
+    with cache_of(map_path).open("rb") as stream:
+        found = cache_file.read(stream, {}, large=100)
+    assert found is not None
+    return found
+
+
+def test_the_gaussians_of_a_large_map_stay_in_the_file(map_file):
+    prepared, large = prepare(load_map(map_file), large=100), large_from_file(map_file)
+    assert_same(large, prepared)
+    assert isinstance(large.gaussians, StoredArray)
+    assert isinstance(large.sh, StoredArray)
+    assert large.leaves == prepared.leaves < len(prepared.sizes)
+    np.testing.assert_array_equal(large.unpacked(1).sh, prepared.unpacked(1).sh)
+    np.testing.assert_array_equal(large.solid_points(50), prepared.solid_points(50))
+
+
+@pytest.mark.parametrize("room", [3, 4, 100])
+def test_chunks_that_were_read_are_drawn_as_if_all_were_in_memory(map_file, monkeypatch, room: int):
+    """In whatever order views come, and however few chunks there is room for."""
+    monkeypatch.setattr(stored, "MAX_CHUNKS", room)
+    prepared, from_file = prepare(load_map(map_file), large=100), large_from_file(map_file)
+    resident, rng = Resident(from_file), np.random.default_rng(0)
+    assert len(resident.gaussians) == min(room, len(prepared.sizes))
+    for _ in range(30):
+        count = rng.integers(min(room, len(prepared.sizes)) + 1)
+        chunks = np.sort(rng.choice(len(prepared.sizes), count, replace=False))
+        slots = resident.slots(chunks)
+        assert len(set(slots)) == count
+        assert resident.gaussians[slots].tobytes() == prepared.gaussians[chunks].tobytes()
+        assert resident.sh[slots].tobytes() == prepared.sh[chunks].tobytes()
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda path: os.truncate(path, path.stat().st_size // 2), "was changed"),
+        (lambda path: os.truncate(path, 0), "was cut short"),
+        (lambda path: path.write_bytes(path.read_bytes()), "was changed"),
+        (lambda path: path.write_bytes(bytes(path.stat().st_size)), "was changed"),
+    ],
+    ids=["cut short", "emptied", "written again", "overwritten"],
+)
+def test_a_large_map_whose_file_is_changed_in_place_is_refused(map_file, change, says: str):
+    """Were it mapped into memory, the process would end."""
+    renderer = create_renderer(large_from_file(map_file), "cpu")
+    change(cache_of(map_file))
+    for _ in range(2):
+        with pytest.raises(StaleMapError, match=f"{cache_of(map_file).name}: {says}"):
+            renderer.render(small_camera(), VIEWS["everything"])
+
+
+@pytest.mark.parametrize("change", [Path.unlink, lambda path: path.rename(path.with_name("other"))])
+def test_a_large_map_whose_file_is_removed_or_replaced_is_drawn_all_the_same(map_file, change):
+    whole = create_renderer(prepare(load_map(map_file), large=100), "cpu")
+    renderer = create_renderer(large_from_file(map_file), "cpu")
+    change(cache_of(map_file))
+    cache_of(map_file).write_bytes(b"another")
+    a, b = (drawn.render(small_camera(), VIEWS["everything"]) for drawn in (whole, renderer))
+    np.testing.assert_array_equal(a.rgb, b.rgb)
+
+
+def test_a_large_map_of_one_level_is_damaged(map_file):
+    """A view of it might be of more chunks than there is room for."""
     with cache_of(map_file).open("w+b") as stream:
-        cache_file.write(stream, prepared, {})
-    content = cache_of(map_file).read_bytes()
-    with cache_of(map_file).open("rb") as stream:
-        mapped = cache_file.read(stream, {}, large=100)
-    assert mapped is not None
-    assert_same(mapped, prepared)
-    assert mapped.leaves == prepared.leaves < len(prepared.sizes)
-    for name in ARRAYS:
-        array = getattr(mapped, name)
-        assert array.flags.c_contiguous
-        assert array.flags.writeable
-        assert isinstance(array.base.base.obj, mmap.mmap)
-        array[...] = 0
-    assert cache_of(map_file).read_bytes() == content
+        cache_file.write(stream, prepare(load_map(map_file)), {})
+    with cache_of(map_file).open("rb") as stream, pytest.raises(cache_file.CacheError, match="is damaged"):
+        cache_file.read(stream, {}, large=100)
 
 
 def test_no_flipped_byte_of_a_large_map_goes_unnoticed(map_file):

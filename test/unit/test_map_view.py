@@ -8,9 +8,12 @@ import numpy as np
 import pytest
 
 from gsfeatloc_ros.common.geometry import so3_exp
-from gsfeatloc_ros.maps.cloud import point_cloud
-from gsfeatloc_ros.maps.gaussian_map import GaussianMap
-from gsfeatloc_ros.maps.occupancy import FREE, OCCUPIED, UNKNOWN, Slice, occupancy
+from gsfeatloc_ros.maps import assemble, load_map, look_through
+from gsfeatloc_ros.maps import occupancy as occupancy_module
+from gsfeatloc_ros.maps.cloud import CloudMaker, PointCloud
+from gsfeatloc_ros.maps.gaussian_map import GaussianMap, MapError
+from gsfeatloc_ros.maps.occupancy import FREE, OCCUPIED, UNKNOWN, Occupancy, OccupancyMaker, Slice
+from gsfeatloc_ros.maps.ply import write_ply
 from gsfeatloc_ros.maps.similarity import Similarity
 
 SLICE = Slice(0.1, 1.0, 0.05)
@@ -28,6 +31,18 @@ def made(means, scales=(0.02, 0.02, 0.001), opacities=0.9) -> GaussianMap:
         np.broadcast_to(np.float32(opacities), count),
         sh,
     )
+
+
+def point_cloud(gaussian_map: GaussianMap, count: int) -> PointCloud:
+    maker = CloudMaker(count)
+    maker.add(gaussian_map)
+    return maker.cloud()
+
+
+def occupancy(gaussian_map: GaussianMap, slice_: Slice) -> Occupancy:
+    maker = OccupancyMaker(slice_)
+    maker.add(gaussian_map)
+    return maker.grid()
 
 
 @pytest.mark.parametrize("count", [0, 1])
@@ -86,6 +101,53 @@ def test_a_floater_far_away_does_not_make_the_grid_large(room_map):
     means = room_map.means.copy()
     means[0] = [900.0, 900.0, 0.5]
     assert max(occupancy(replace(room_map, means=means), SLICE).cells.shape) < 200
+
+
+def test_part_by_part_it_is_the_same_however_small_they_are(room_map, tmp_path, monkeypatch):
+    """As a map is read that does not fit into memory."""
+    factors = np.random.default_rng(0).uniform(0.5, 1.5, (len(room_map), 1)).astype(np.float32)
+    path = tmp_path / "map.ply"
+    write_ply(path, replace(room_map, scales=factors * room_map.scales))
+    turned = Similarity(1.5, so3_exp(np.array([0.0, 0.0, 0.3])), np.array([1.0, 2.0, 0.0]))
+    monkeypatch.setattr(assemble, "MAX_PART_ROWS", 2 * assemble.MAX_BLOCK_ROWS)
+    monkeypatch.setattr(occupancy_module, "_POINTS_AT_ONCE", 10_000)
+    monkeypatch.setattr(occupancy_module, "_MAX_NEW", 100_000)
+    cloud, grid, sizes = CloudMaker(2000), OccupancyMaker(SLICE), []
+
+    def look(part: GaussianMap) -> None:
+        sizes.append(len(part))
+        cloud.add(part)
+        grid.add(part)
+
+    look_through(path, look, turned)
+    assert max(sizes) <= 2 * assemble.MAX_BLOCK_ROWS
+    assert sum(sizes) == len(room_map)
+    whole = load_map(path, turned)
+    expected = point_cloud(whole, 2000)
+    order, expected_order = (np.lexsort(points.T) for points in (cloud.cloud().points, expected.points))
+    np.testing.assert_array_equal(cloud.cloud().points[order], expected.points[expected_order])
+    np.testing.assert_array_equal(cloud.cloud().colours[order], expected.colours[expected_order])
+    np.testing.assert_array_equal(grid.grid().cells, occupancy(whole, SLICE).cells)
+    np.testing.assert_array_equal(grid.grid().origin, occupancy(whole, SLICE).origin)
+
+
+def test_what_is_far_from_the_origin_of_its_file_is_in_its_place_part_by_part(tmp_path):
+    far = np.array([1e6, -2e6, 0.0])
+    write_ply(tmp_path / "far.ply", replace(made([[0.5, 0.5, 0.5], [1, 2, 0.5]]), S_map_splat=Similarity()))
+    places: list[np.ndarray] = []
+    look_through(
+        tmp_path / "far.ply",
+        lambda part: places.append(part.S_map_splat.transform(part.means.astype(np.float64))),
+        Similarity(translation=far),
+    )
+    np.testing.assert_allclose(np.concatenate(places) - far, [[0.5, 0.5, 0.5], [1, 2, 0.5]], atol=1e-6)
+
+
+def test_a_map_that_cannot_be_used_is_refused_part_by_part(tmp_path):
+    gaussian_map = made(np.full((10, 3), np.nan))
+    write_ply(tmp_path / "map.ply", gaussian_map)
+    with pytest.raises(MapError, match="10 of 10 Gaussians have values that are NaN"):
+        look_through(tmp_path / "map.ply", lambda part: None)
 
 
 def test_a_slice_without_height_is_refused():
