@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor, await_or_execute
+from rclpy.impl.implementation_singleton import rclpy_implementation
 
 # So many failures in a row, over so many seconds without one callback that ended well, and nothing is to be hoped for.
 _MAX_FAILURES = 10
 _MAX_SECONDS = 10.0
+# Requests that are taken from a service before all else is looked at again.
+_MAX_REQUESTS = 64
 # Seconds of rest after a failure of the loop itself: what is missing, memory say, may be there again.
 _REST = 0.1
 
@@ -24,6 +28,9 @@ class GuardedExecutor(SingleThreadedExecutor):
 
     rclpy lets such an exception end the process. One of the taking (no memory for a big request) leaves the topic or
     service, and all others of its callback group, blocked for good besides.
+
+    Of a service all requests that wait are taken together. rclpy takes one, and then makes a new wait set of all that
+    the node has, which takes more time than most requests do: of many that come at once the last would wait for long.
 
     Args:
         on_failure: is told each exception.
@@ -63,20 +70,48 @@ class GuardedExecutor(SingleThreadedExecutor):
             except Exception as error:
                 self._fail(error)
                 return None
-            return None if execute is None else guarded(execute)
-
-        def guarded(execute: Callable[[], Any]) -> Callable[[], Any]:
-            async def run() -> None:
-                try:
-                    await execute()
-                except Exception as error:
-                    self._fail(error)
-                else:
-                    self._failures = 0
-
-            return run
+            return None if execute is None else self._guarded(execute)
 
         return super()._make_handler(entity, node, take)
+
+    def _take_service(self, service: Any) -> Callable[[], Any] | None:
+        """Take the requests that wait, and return a coroutine function that has them answered one after another."""
+        requests: list[Any] = []
+        try:
+            with service.handle:
+                while len(requests) < _MAX_REQUESTS and (taken := self._take_request(service))[1] is not None:
+                    requests.append(taken)
+        except rclpy_implementation.InvalidHandle:
+            return None
+        except Exception as error:
+            self._fail(error)
+
+        async def answer(request: Any, header: Any) -> None:
+            response = await await_or_execute(service.callback, request, service.srv_type.Response())
+            service.send_response(response, header)
+
+        async def answer_all() -> None:
+            for taken in requests:
+                self.create_task(self._guarded(partial(answer, *taken)))
+
+        return answer_all if requests else None
+
+    def _take_request(self, service: Any) -> tuple[Any, Any]:
+        """Return a request and whose it is; None and None where none waits."""
+        return service.handle.service_take_request(service.srv_type.Request)  # type: ignore[no-any-return]
+
+    def _guarded(self, execute: Callable[[], Any]) -> Callable[[], Any]:
+        """Return a coroutine function that does not raise."""
+
+        async def run() -> None:
+            try:
+                await execute()
+            except Exception as error:
+                self._fail(error)
+            else:
+                self._failures = 0
+
+        return run
 
     def _fail(self, error: Exception) -> None:
         if not self._failures:

@@ -132,6 +132,8 @@ class Services:
 
     async def _await(self, done: Future[JobResult]) -> JobResult:
         """Wait for the worker, without holding up the executor."""
+        if done.done():
+            return done.result()
         answer, executor = rclpy.task.Future(), self._node.executor
         assert executor is not None  # this is run by it
         self.unanswered += 1

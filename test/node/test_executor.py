@@ -10,6 +10,7 @@ from rcl_interfaces.msg import ParameterType
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
+from rclpy.qos import HistoryPolicy, QoSProfile
 from std_srvs.srv import Trigger
 
 from gsfeatloc_ros.node import executor as executor_module
@@ -34,8 +35,8 @@ def guarded_node(now=None):
         rclpy.shutdown(context=context)
 
 
-def spin_until(executor, condition) -> None:
-    for _ in range(1000):
+def spin_until(executor, condition, times: int = 1000) -> None:
+    for _ in range(times):
         if condition():
             return
         executor.spin_once(0.01)
@@ -61,19 +62,69 @@ def test_a_message_that_cannot_be_taken_blocks_nothing(monkeypatch):
         node.create_service(Trigger, "serve", lambda request, response: response)
         client = node.create_client(Trigger, "serve")
         spin_until(executor, client.service_is_ready)
-        taken = SingleThreadedExecutor._take_service
+        take = GuardedExecutor._take_request
 
         def no_memory(self, service):
             if service.srv_name == "serve" and not failures:
-                taken(self, service)
+                take(self, service)
                 raise MemoryError
-            return taken(self, service)
+            return take(self, service)
 
-        monkeypatch.setattr(SingleThreadedExecutor, "_take_service", no_memory)
+        monkeypatch.setattr(GuardedExecutor, "_take_request", no_memory)
         client.call_async(Trigger.Request())
         spin_until(executor, lambda: failures)
         again = client.call_async(Trigger.Request())
         spin_until(executor, again.done)
+        assert [type(failure) for failure in failures] == [MemoryError]
+
+
+@pytest.mark.parametrize("asynchronous", [False, True])
+def test_of_requests_that_come_together_each_is_answered_once_and_timers_run_between(asynchronous: bool):
+    served, ticks = [], []
+
+    def serve(request, response):
+        served.append(len(ticks))
+        response.message = str(len(served))
+        return response
+
+    async def serve_later(request, response):
+        await wait
+        return serve(request, response)
+
+    with guarded_node() as (node, executor, failures):
+        wait = rclpy.task.Future()
+        qos = QoSProfile(history=HistoryPolicy.KEEP_ALL)
+        node.create_service(Trigger, "serve", serve_later if asynchronous else serve, qos_profile=qos)
+        client = node.create_client(Trigger, "serve", qos_profile=qos)
+        spin_until(executor, client.service_is_ready)
+        count = 3 * executor_module._MAX_REQUESTS
+        answers = [client.call_async(Trigger.Request()) for _ in range(count)]
+        node.create_timer(1e-4, lambda: ticks.append(1))
+        spin_until(executor, lambda: ticks)
+        wait.set_result(None)
+        spin_until(executor, lambda: all(answer.done() for answer in answers), 20 * count)
+        assert sorted(int(answer.result().message) for answer in answers) == list(range(1, count + 1))
+        assert not failures
+        # They did not all come first.
+        assert len(set(served)) > 1
+
+
+def test_a_request_that_cannot_be_taken_costs_no_other(monkeypatch):
+    with guarded_node() as (node, executor, failures):
+        node.create_service(Trigger, "serve", lambda request, response: response)
+        client = node.create_client(Trigger, "serve")
+        spin_until(executor, client.service_is_ready)
+        take, numbers = GuardedExecutor._take_request, iter(range(1000))
+
+        def no_memory_for_the_third(self, service):
+            taken = take(self, service)
+            if taken[1] is not None and next(numbers) == 2:
+                raise MemoryError
+            return taken
+
+        monkeypatch.setattr(GuardedExecutor, "_take_request", no_memory_for_the_third)
+        answers = [client.call_async(Trigger.Request()) for _ in range(6)]
+        spin_until(executor, lambda: sum(answer.done() for answer in answers) == 5)
         assert [type(failure) for failure in failures] == [MemoryError]
 
 
