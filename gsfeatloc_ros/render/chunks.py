@@ -23,8 +23,8 @@ CHUNK = 256
 ROWS = 10
 # A map of more Gaussians than this gets coarser levels, and stays on disk; one of as many is drawn exactly.
 LARGE_MAP = 1 << 20
-# A view of such a map is drawn from no more chunks, 786 432 Gaussians: memory and time have this bound.
-MAX_CHUNKS = 3072
+# A view of such a map is drawn from no more chunks: memory has this bound.
+MAX_CHUNKS = LARGE_MAP // CHUNK
 # Most that a merged Gaussian is opaque: where there are more layers of them, more is not seen.
 MAX_LOG2_OPACITY = 2.0
 # Chunks of a level, neighbours, that one of the next coarser level stands for.

@@ -14,8 +14,11 @@ from gsfeatloc_ros.render.camera_view import CameraView, frustum, is_outside, vi
 from gsfeatloc_ros.render.chunks import BRANCHING, MAX_CHUNKS, PreparedMap
 from gsfeatloc_ros.render.levels import MAX_SIZE
 
-# Where a view would be drawn from more than MAX_CHUNKS, merged Gaussians may be larger the farther they are beyond some
-# depth: what stands near hides much of what lies behind. That depth is found by so many halvings between these.
+# A view of so many pixels is drawn from so many chunks at most, half a million Gaussians, which takes about as long as
+# one in a map of a million. Of other views the bound goes with the root: coarse ones need what is near as well.
+_PIXELS, _CHUNKS = 640 * 480, 2048
+# Where there would be more, merged Gaussians may be larger the farther they are beyond some depth: what stands near
+# hides much of what lies behind. That depth is found by so many halvings between these.
 _HALVINGS, _LEAST, _FARTHEST = 8, 1e-3 * NEAR_PLANE, 1e12
 # More than a path from the coarsest level to the finest leaves undone on its way.
 _STACK_SIZE = 128
@@ -26,7 +29,7 @@ class Cut:
 
     Args:
         prepared: the map.
-        max_chunks: that a view is drawn from, of a map with coarser levels.
+        max_chunks: that a view is drawn from, however large it is, of a map with coarser levels.
     """
 
     def __init__(self, prepared: PreparedMap, max_chunks: int = MAX_CHUNKS) -> None:
@@ -44,27 +47,28 @@ class Cut:
         if len(self._starts) == 2:
             return visible_chunks(view, self._low, self._high)
         sides = frustum(view)
+        most = min(self._max_chunks, int(_CHUNKS * math.sqrt(view.width * view.height / _PIXELS)))
 
         def cut(scale: float, reach: float) -> np.ndarray:
             boxes = (self._low, self._high, self._sizes, self._starts)
-            return _cut(*boxes, view.origin, view.forward, scale, reach, *sides, self._max_chunks)
+            return _cut(*boxes, view.origin, view.forward, scale, reach, *sides, most)
 
         scale = float(max(view.fx, view.fy)) / MAX_SIZE
         chunks = cut(scale, math.inf)
-        if len(chunks) <= self._max_chunks:
+        if len(chunks) <= most:
             return chunks
         # Of the whole map; it may be infinite.
         size = float(np.abs(np.stack([self._low[-1], self._high[-1]]) - view.origin).sum())
-        least, most = math.log(_LEAST), math.log(max(min(_FARTHEST, size), _LEAST))
+        near, far = math.log(_LEAST), math.log(max(min(_FARTHEST, size), _LEAST))
         for _ in range(_HALVINGS):
-            reach = 0.5 * (least + most)
+            reach = 0.5 * (near + far)
             fewer = cut(scale, math.exp(reach))
-            if len(fewer) <= self._max_chunks:
-                chunks, least = fewer, reach
+            if len(fewer) <= most:
+                chunks, near = fewer, reach
             else:
-                most = reach
+                far = reach
         # At last any size will do: a merged Gaussian may be infinite.
-        return chunks if len(chunks) <= self._max_chunks else cut(0.0, math.inf)
+        return chunks if len(chunks) <= most else cut(0.0, math.inf)
 
 
 @njit(nogil=True, cache=True)
