@@ -6,8 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsfeatloc_ros.common.kernels import njit
-
 # Matches nearer to each other than the first, in pixels, are neighbours: they share the blur, the splat, the edge.
 # What those between the two have in common is a field that is smooth over the photo.
 _NEIGHBOUR_DISTANCE, _FIELD_DISTANCE = 25.0, 60.0
@@ -44,11 +42,13 @@ class ResidualField:
 
         Residuals longer than `max_error` pixels count among neighbours alone: a cluster of wrong matches is no field.
         """
+        from gsfeatloc_ros.pose.kernels import mean_products
+
         step = 1 + len(pixels) // _MAX_PAIRED
         pixels, residuals = pixels[::step], residuals[::step]
         agrees = (residuals**2).sum(axis=1) <= max_error**2
         total = 0.5 * float((residuals[agrees] ** 2).sum(axis=1).mean()) if agrees.any() else 0.0
-        near, smooth = _means(pixels, residuals, agrees)
+        near, smooth = mean_products(pixels, residuals, agrees, _NEIGHBOUR_DISTANCE, _FIELD_DISTANCE)
         return ResidualField(near, smooth, total)
 
     @property
@@ -64,23 +64,3 @@ class ResidualField:
     def shared_variance(self) -> float:
         """Variance, in square pixels along an axis, of what the pose is off by, by the smooth field in all."""
         return max(self.smooth - _USUAL_FIELD, 0.0) + self.bent_variance
-
-
-@njit(cache=True, nogil=True)
-def _means(pixels, residuals, agrees):
-    """Return half the mean product of residuals of neighbours, and of those farther apart; 0 where it is negative."""
-    near = apart = 0.0
-    near_pairs = apart_pairs = 0
-    for a in range(len(pixels)):
-        for b in range(a):
-            distance = (pixels[a, 0] - pixels[b, 0]) ** 2 + (pixels[a, 1] - pixels[b, 1]) ** 2
-            if distance >= _FIELD_DISTANCE**2:
-                continue
-            product = 0.5 * (residuals[a, 0] * residuals[b, 0] + residuals[a, 1] * residuals[b, 1])
-            if distance < _NEIGHBOUR_DISTANCE**2:
-                near += product
-                near_pairs += 1
-            elif agrees[a] and agrees[b]:
-                apart += product
-                apart_pairs += 1
-    return max(near / max(near_pairs, 1), 0.0), max(apart / max(apart_pairs, 1), 0.0)
