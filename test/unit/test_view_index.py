@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import faiss
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -98,6 +99,12 @@ def test_the_same_views_give_the_same_index() -> None:
         np.testing.assert_array_equal(array, getattr(b, name))
     photo = photo_of(unit_vectors(np.random.default_rng(0), 100, 128))
     np.testing.assert_array_equal(votes_of(a, photo), votes_of(b, photo))
+
+
+def test_what_faiss_is_told_for_the_compression_holds_for_it_alone() -> None:
+    usual = faiss.cvar.distance_compute_blas_threshold
+    made_up_index(views=3, features=20, dimension=128)
+    assert faiss.cvar.distance_compute_blas_threshold == usual
 
 
 @pytest.mark.parametrize("dimension", [1, 100])
