@@ -105,13 +105,14 @@ class _Cells:
 
     def __init__(self) -> None:
         # A cell is one number: to sort numbers takes a fraction of the time of sorting rows.
-        self._cells, self._counts = np.zeros(0, np.int64), np.zeros(0, np.int64)
+        self._cells: np.ndarray = np.zeros(0, np.int64)
+        self._counts: np.ndarray = np.zeros(0, np.int64)
         self._new: list[np.ndarray] = []
 
     def add(self, places: np.ndarray) -> None:
         """Count points at places (n, 2)."""
-        x, y = (np.clip(places, -_MAX_PLACE, _MAX_PLACE - 1) + _MAX_PLACE).astype(np.int64).T
-        self._new.append(x * (2 * _MAX_PLACE) + y)
+        counted = (np.clip(places, -_MAX_PLACE, _MAX_PLACE - 1) + _MAX_PLACE).astype(np.int64)
+        self._new.append(counted[:, 0] * (2 * _MAX_PLACE) + counted[:, 1])
         if sum(map(len, self._new)) > _MAX_NEW:
             self.found()
 
@@ -121,7 +122,8 @@ class _Cells:
         self._cells, cells = np.unique(np.concatenate([self._cells, *self._new]), return_inverse=True)
         self._counts = np.bincount(cells, counts, len(self._cells)).astype(np.int64)
         self._new = []
-        return np.stack(np.divmod(self._cells, 2 * _MAX_PLACE), axis=1) - _MAX_PLACE, self._counts
+        places = np.column_stack([self._cells // (2 * _MAX_PLACE), self._cells % (2 * _MAX_PLACE)])
+        return places - _MAX_PLACE, self._counts
 
 
 def _quantiles(places: np.ndarray, counts: np.ndarray) -> np.ndarray:

@@ -98,7 +98,8 @@ class GuardedExecutor(SingleThreadedExecutor):
 
     def _take_request(self, service: Any) -> tuple[Any, Any]:
         """Return a request and whose it is; None and None where none waits."""
-        return service.handle.service_take_request(service.srv_type.Request)  # type: ignore[no-any-return]
+        taken: tuple[Any, Any] = service.handle.service_take_request(service.srv_type.Request)
+        return taken
 
     def _guarded(self, execute: Callable[[], Any]) -> Callable[[], Any]:
         """Return a coroutine function that does not raise."""

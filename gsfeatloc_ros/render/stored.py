@@ -35,7 +35,7 @@ class StoredFile:
     def read(self, offset: int, parts: list[np.ndarray]) -> None:
         """Fill contiguous arrays with what is in the file from `offset` on; raise OSError where that fails."""
         for first in range(0, len(parts), _PARTS):
-            some = parts[first : first + _PARTS]
+            some = [part.data for part in parts[first : first + _PARTS]]
             size = sum(part.nbytes for part in some)
             if os.preadv(self._file.fileno(), some, offset) != size:
                 raise OSError("was cut short")
@@ -46,7 +46,7 @@ class StoredFile:
     def write(self, offset: int, parts: list[np.ndarray]) -> None:
         """Write contiguous arrays one after another from `offset` on; raise OSError where that fails."""
         for first in range(0, len(parts), _PARTS):
-            some = parts[first : first + _PARTS]
+            some = [part.data for part in parts[first : first + _PARTS]]
             size = sum(part.nbytes for part in some)
             if os.pwritev(self._file.fileno(), some, offset) != size:
                 raise OSError("there is no room for it")
@@ -98,7 +98,8 @@ class Resident:
     """
 
     def __init__(self, prepared: PreparedMap) -> None:
-        self._stored = []
+        # What is in the file, and the room for it.
+        self._stored: list[tuple[StoredArray, np.ndarray]] = []
         self.gaussians, self.sh = self._room(prepared.gaussians), self._room(prepared.sh)
         # Where each chunk is, and what is in each slot, -1 for nothing; and in which view it was used last.
         self._slots = np.full(len(prepared.sizes), -1)
