@@ -522,7 +522,7 @@ def _exp2_and_columns(values, powers, columns):
     simd.store(powers, 0, simd.exp2(rows))
     zero = simd.broadcast(np.float32(0))
     matrix = (rows, zero, rows * 2, rows, rows, rows, rows, rows, rows, rows, rows, rows, rows, rows, rows, rows - 1)
-    return simd.store_columns(columns, 0, rows > 0, matrix)
+    return simd.store_columns(columns, 0, rows > 0, matrix), simd.total(rows)
 
 
 @settings(max_examples=50, deadline=None)
@@ -530,7 +530,8 @@ def _exp2_and_columns(values, powers, columns):
 def test_lanes_calculate_as_numbers_do(numbers: list[float]) -> None:
     values = np.array(numbers, dtype=np.float32)
     powers, columns = np.empty(simd.LANES, np.float32), np.empty(simd.LANES**2, np.float32)
-    end = _exp2_and_columns(values, powers, columns)
+    end, total = _exp2_and_columns(values, powers, columns)
+    assert total == pytest.approx(values.sum(dtype=np.float64), rel=1e-5, abs=1e-3)
     np.testing.assert_allclose(powers, np.exp2(values.astype(np.float64)), rtol=5e-6)
     positive = values[values > 0]
     assert end == simd.LANES * len(positive)
