@@ -11,8 +11,10 @@ from gsfeatloc_ros.common.local_structure import local_structure
 
 # Photo and render are compared at this width.
 _WIDTH = 320
-# Blur shows where the photo's gradients along some direction have less than this share of the render's energy.
+# Blur shows where the photo's gradients along some direction have less than this share of the render's energy; or, as
+# the map may be less sharp than photos are, where that share is less than this part of the one across.
 _MAX_ENERGY_RATIO = 0.45
+_MAX_RELATIVE_RATIO = 0.55
 # What the render's gradients are given in every direction, as a share of their energy.
 _MIN_ENERGY = 1e-3
 # Lengths of a motion and widths of a defocus that are tried, in shares of the photo's width.
@@ -68,7 +70,7 @@ def _blurred_direction(photo: np.ndarray, render: np.ndarray) -> float | None:
     # The generalized eigenvalues are the ratios of energy; a little of all directions keeps the render's invertible.
     root = np.linalg.cholesky(render + _MIN_ENERGY * (np.trace(render) + 1.0) * np.eye(2))
     ratios, vectors = np.linalg.eigh(np.linalg.solve(root, np.linalg.solve(root, photo).T))
-    if ratios[0] >= _MAX_ENERGY_RATIO:
+    if ratios[0] >= max(_MAX_ENERGY_RATIO, _MAX_RELATIVE_RATIO * ratios[1]):
         return None
     x, y = np.linalg.solve(root.T, vectors[:, 0])
     return float(np.arctan2(y, x))

@@ -214,8 +214,10 @@ class Localizer:
             blur = estimate_blur(query.photo.gray(), cv2.cvtColor(to_host(view.image), cv2.COLOR_RGB2GRAY))
         passes, max_passes = 1, self._components.options.max_passes
         if blur is not None and passes < max_passes:
-            view = query.track(pose if view.solution is None else view.solution.T_map_camera, blur)
+            blurred = query.track(pose if view.solution is None else view.solution.T_map_camera, blur)
             passes += 1
+            # Of a render that is not yet where the photo is a blur may be seen that is none.
+            view, blur = (blurred, blur) if blurred.inliers >= view.inliers else (view, None)
 
         def approach(view: MatchedView, max_offset: float) -> MatchedView:
             nonlocal passes
