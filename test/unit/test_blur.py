@@ -51,9 +51,9 @@ def test_a_motion_is_found_with_its_direction_and_length(sharp, length: int, deg
 
 @pytest.mark.parametrize("degrees", [0.0, 60.0, 135.0])
 def test_a_motion_is_seen_in_a_map_that_is_less_sharp_than_the_photo(sharp, degrees: float) -> None:
-    soft = cv2.GaussianBlur(sharp, (0, 0), 2.0)
+    soft = cv2.GaussianBlur(sharp, (0, 0), 3.0)
     assert estimate_blur(sharp, soft) is None
-    blur = estimate_blur(moved(sharp, 12, degrees), soft)
+    blur = estimate_blur(moved(sharp, 16, degrees), soft)
     assert blur is not None
     assert abs((main_direction(blur.kernel) - degrees + 90) % 180 - 90) < 20
 
