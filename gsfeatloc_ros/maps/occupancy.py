@@ -23,7 +23,7 @@ _MAX_CELLS = 4096
 # Cells from the origin beyond which all is as far away.
 _MAX_PLACE = 2**30
 # Points that are made, and that are kept before they are counted.
-_POINTS_AT_ONCE, _MAX_NEW = 1 << 18, 1 << 21
+_POINTS_AT_ONCE, _MAX_NEW = 1 << 17, 1 << 19
 
 
 @dataclass(frozen=True)
