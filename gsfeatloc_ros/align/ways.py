@@ -65,11 +65,17 @@ def by_drive(options: argparse.Namespace) -> Alignment:
 def _fitted(options: argparse.Namespace, answers: Sequence[Answer]) -> Alignment:
     """Fit the answers to the trajectory that the options name."""
     mounted = _pose("--extrinsics", options.extrinsics)
+    path = None
+    if options.bag:
+        path = RobotPath(options.bag, options.odom, options.frame, options.camera_frame, options.image, mounted)
     if options.trajectory:
         poses = read_tum(options.trajectory)
+        if options.body:
+            if path is None:
+                raise ValueError("--body: name the bag whose tf tells where the camera is on it: --bag")
+            mounted = path.mounted(options.body)
         poses = poses if mounted is None else [(stamp, pose @ mounted) for stamp, pose in poses]
-    elif options.bag:
-        path = RobotPath(options.bag, options.odom, options.frame, options.camera_frame, options.image, mounted)
+    elif path is not None:
         poses = path.read([answer.stamp for answer in answers])
     else:
         raise ValueError("name the robot's trajectory: --trajectory FILE, or --bag BAG with --odom or --frame")

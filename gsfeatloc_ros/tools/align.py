@@ -196,11 +196,15 @@ def _add_trajectory(way: argparse.ArgumentParser) -> None:
     group.add_argument("--frame", default="odom", metavar="NAME", help="robot's frame in tf (default: %(default)s)")
     group.add_argument("--camera-frame", default="", metavar="NAME", help="default: that of the bag's images")
     group.add_argument(
+        "--body", default="", metavar="NAME", help="frame that the poses of --trajectory are of (default: the camera's)"
+    )
+    group.add_argument(
         "--extrinsics",
         type=_FINITE,
         nargs=7,
         metavar=_POSE,
-        help="pose of the camera's optical frame in the body that the trajectory is of (default: tf; of a file, none)",
+        help="pose of the camera's optical frame in the body that the trajectory is of (default: tf of the bag; of a "
+        "file without --body, none)",
     )
     group.add_argument("--positions-only", action="store_true", help="the trajectory's orientations are not to be used")
     group.add_argument(

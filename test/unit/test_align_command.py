@@ -165,6 +165,25 @@ def test_a_bag_says_where_the_camera_was(tf, tmp_path, capsys):
     assert ("tf to odom" if tf else "--extrinsics") in said
 
 
+def test_a_file_may_have_the_trajectory_of_the_base_whose_camera_the_bag_tells(tmp_path, capsys):
+    truth = random_similarity(np.random.default_rng(3))
+    pairs = as_pairs(curve(8), truth, Errors(), np.random.default_rng(0))
+    answers = write_tum(tmp_path / "answers.tum", pairs.answers)
+    of_base = write_tum(tmp_path / "base.tum", pairs.references @ invert(T_BASE_CAMERA))
+    bag = robot_bag(tmp_path / "bag", pairs.references[:1], [], False)
+    arguments = ["trajectory", "--answers", str(answers), "--trajectory", str(of_base), "--body", "base_link"]
+    arguments += ["--out", str(tmp_path / "map.yaml")]
+    mounted = ["--bag", str(bag), "--camera-frame", CAMERA_FRAME]
+    assert main([*arguments, *mounted]) == 0
+    scale, degrees = far(placed_by(tmp_path / "map.yaml"), truth)
+    assert scale < 1e-6
+    assert degrees < 1e-4
+    assert main(arguments) == 2
+    assert "--body: name the bag" in capsys.readouterr().err
+    assert main([*arguments, *mounted, "--body", "elsewhere"]) == 2
+    assert "elsewhere" in capsys.readouterr().err
+
+
 @pytest.mark.slow
 def test_a_drive_is_localized_and_aligned(room_camera, room_photos, room_map_file, tmp_path, capsys):
     """Map and answers are in a frame of their own; the robot's is the room's."""
