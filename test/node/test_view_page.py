@@ -71,6 +71,13 @@ def test_a_user_sees_the_map_stands_at_an_answer_and_sets_the_floor(page, tmp_pa
         user.wait_for_text("off that")
         user.press("Write map.yaml")
         user.wait_for_text("wrote ")
+        user.press("Scale: click two points so far apart")
+        user.wait_for_text("0 of 2 clicked")
+        # Left of the panel, and below what viser says of a browser without a GPU.
+        user.click(60, 300)
+        user.wait_for_text("1 of 2 clicked")
+        user.click(250, 420)
+        user.wait_for_text("units are 1 m: scale")
     values = read_parameter_file(parameters)
     np.testing.assert_allclose(values["map.translation"], [0, 0, 0], atol=0.05)
 

@@ -65,7 +65,10 @@ class Browser:
             f"[...document.querySelectorAll('button,[role=tab]')].find(b => b.textContent.includes({json.dumps(text)}))"
         )
         middle = "(b.scrollIntoView(), (r => [r.x + r.width / 2, r.y + r.height / 2])(b.getBoundingClientRect()))"
-        x, y = self.wait_for(f"(b => b && {middle})({button})")
+        self.click(*self.wait_for(f"(b => b && {middle})({button})"))
+
+    def click(self, x: float, y: float) -> None:
+        """Click with the mouse at a pixel of the page."""
         for kind in ("mouseMoved", "mousePressed", "mouseReleased"):
             self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
 
