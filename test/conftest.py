@@ -74,6 +74,13 @@ def photo(room_photos: list[SimulatedPhoto]) -> SimulatedPhoto:
     return room_photos[0]
 
 
+@pytest.fixture
+def tf(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let a localizer that is started find tf2_ros: where none is installed, the stand-in."""
+    stand_in = str(Path(__file__).parent / "support" / "tf2_stand_in")
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([os.environ.get("PYTHONPATH", ""), stand_in]))
+
+
 # What talks to ROS is imported in here: see pytest_configure.
 
 

@@ -45,6 +45,7 @@ class LiveNode(ClientNode):
         self._listen(PoseWithCovarianceStamped, "pose", self._on_pose, LATCHED)
         self._listen(DiagnosticArray, "/diagnostics", self._on_diagnostics)
         self._listen(PoseArray, f"{name}/candidates", self._on_candidates)
+        self._listen(PoseArray, f"{name}/searched", self._on_searched)
         self._listen(Image, "debug_image", self._on_debug_image)
         self._listen(PoseStamped, "prior", self._on_prior)
         self._listen(PoseWithCovarianceStamped, "prior_with_covariance", self._on_prior)
@@ -104,10 +105,12 @@ class LiveNode(ClientNode):
                 self._store.add(Attempt(nanos, diagnostic.values["status"], diagnostic.reason))
 
     def _on_candidates(self, message: PoseArray) -> None:
-        if message.header.frame_id == self._frame and message.poses:
-            header = message.header
-            poses = np.array([decode_pose(PoseStamped(header=header, pose=p), "candidate") for p in message.poses])
-            self._store.add(Attempt(nanoseconds(header.stamp), "", "", candidates=poses))
+        if message.header.frame_id == self._frame:
+            self._store.add(Attempt(nanoseconds(message.header.stamp), "", "", candidates=_poses(message)))
+
+    def _on_searched(self, message: PoseArray) -> None:
+        if message.header.frame_id == self._frame:
+            self._store.add(Attempt(nanoseconds(message.header.stamp), "", "", searched=_poses(message)))
 
     def _on_debug_image(self, message: Image) -> None:
         self._store.add_picture(nanoseconds(message.header.stamp), encoded(decode_image(message)))
@@ -115,3 +118,9 @@ class LiveNode(ClientNode):
     def _on_prior(self, message: PoseStamped | PoseWithCovarianceStamped) -> None:
         if message.header.frame_id == self._frame:
             self._store.add_prior(decode_pose(message, "prior"))
+
+
+def _poses(message: PoseArray) -> np.ndarray:
+    """Return the poses (N, 4, 4) of a message."""
+    poses = [decode_pose(PoseStamped(header=message.header, pose=pose), "pose") for pose in message.poses]
+    return np.array(poses).reshape(-1, 4, 4)

@@ -72,6 +72,8 @@ class Trace:
         correspondences: pixels of the inliers (photo, render).
         changed: makes the mask of where the photo shows something else than the map: (H, W) uint8, 255 there; None
             where no pose was found.
+        searched: (4, 4) each, T_map_camera of the views of the map in which the photo was looked for: the prior's,
+            those of the index, and others that were rendered to find it.
     """
 
     estimate: Estimate
@@ -79,3 +81,4 @@ class Trace:
     render: Render | None = None
     correspondences: Matches = field(default_factory=Matches.none)
     changed: Callable[[], np.ndarray] | None = None
+    searched: tuple[np.ndarray, ...] = ()

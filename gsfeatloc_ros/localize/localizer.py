@@ -138,12 +138,14 @@ class Localizer:
         def plausible(pose: np.ndarray) -> bool:
             return prior is None or prior.deviation(pose) <= options.limits.max_deviation
 
-        trace = self._search(Query(self._components, photo, clock, plausible), prior)
-        return replace(trace, estimate=replace(trace.estimate, milliseconds=clock.milliseconds()))
-
-    def _search(self, query: Query, prior: Prior | None) -> Trace:
-        """Look at small views of the map, at the prior and then where else it may be, and refine what they suggest."""
+        query = Query(self._components, photo, clock, plausible)
         search = Search(query, prior, self._now)
+        trace = self._search(query, search, prior)
+        estimate = replace(trace.estimate, milliseconds=clock.milliseconds())
+        return replace(trace, estimate=estimate, searched=tuple(search.poses_looked_from))
+
+    def _search(self, query: Query, search: Search, prior: Prior | None) -> Trace:
+        """Look at small views of the map, at the prior and then where else it may be, and refine what they suggest."""
         likeliest: _Candidate | None = None
         try:
             reason = too_little(query)

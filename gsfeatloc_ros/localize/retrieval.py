@@ -38,8 +38,8 @@ class Hint:
     weight: float
 
 
-def retrieve(small: Query, likely: Callable[[np.ndarray], bool], skipped: int = 0) -> Iterator[Hint | None]:
-    """Yield what each view of the index suggests, the view that most speaks for first; None where it is nothing.
+def retrieve(small: Query, likely: Callable[[np.ndarray], bool], skipped: int = 0) -> Iterator[tuple[int, Hint | None]]:
+    """Yield the index's views and what each suggests, the one that most speaks for first; None where it is nothing.
 
     Args:
         small: the photo, at most SEARCH_WIDTH wide, and the index. It is looked for upside down and on its sides too,
@@ -70,10 +70,10 @@ def retrieve(small: Query, likely: Callable[[np.ndarray], bool], skipped: int = 
         with small.clock.stage("search"):
             hint = groups[turns].hint(view)
         if hint is None:
-            yield None
+            yield view, None
         else:
             pose, inliers = hint
-            yield Hint(pose, inliers, inliers * weight(pose))
+            yield view, Hint(pose, inliers, inliers * weight(pose))
 
 
 def _turned(small: Query, turns: int) -> Features:

@@ -64,6 +64,7 @@ class Search:
         best: the view that had most in common with the photo so far; None before one was rendered.
         views: number of views, other than the prior's, that were rendered to find the photo.
         searched: number of the index's views that were compared with it.
+        poses_looked_from: (4, 4) each, of all these views, the prior's included, in the order in which they were.
     """
 
     def __init__(self, query: Query, prior: Prior | None, now: Callable[[], float]) -> None:
@@ -71,6 +72,7 @@ class Search:
         self.small = query.limited(SEARCH_WIDTH)
         self.best: MatchedView | None = None
         self.views = self.searched = self._around = 0
+        self.poses_looked_from: list[np.ndarray] = []
         self._at_prior = False
         self._pending: list[tuple[float, int, Hint]] = []
         self._tried: list[_Place] = []
@@ -98,6 +100,7 @@ class Search:
                 batch = poses[start : start + _BATCH]
                 self._around += len(batch)
                 self.views += len(batch)
+                self.poses_looked_from += batch
                 yield from self._hints(look(self.small, batch))
 
     @property
@@ -157,6 +160,7 @@ class Search:
         Only where that is likely to be cheaper than to find features.
         """
         self._at_prior = True
+        self.poses_looked_from.append(prior.pose)
         full = self._query.photo.camera
         if may_be_settled(full, prior) and is_settled(self._query.render(prior.pose), full, prior):
             yield prior.pose
@@ -195,11 +199,13 @@ class Search:
         """Return whether the prior holds a pose (4, 4) for possible."""
         return self._prior is None or self._prior.deviation(pose) <= _MAX_DEVIATION
 
-    def _compare(self, hints: Iterator[Hint | None]) -> bool:
+    def _compare(self, hints: Iterator[tuple[int, Hint | None]]) -> bool:
         """Take in what views of the index suggest; return whether there were any."""
-        before = self.searched
-        for hint in hints:
+        index, before = self.small.components.index, self.searched
+        assert index is not None
+        for view, hint in hints:
             self.searched += 1
+            self.poses_looked_from.append(index.poses[view])
             if hint is not None:
                 heapq.heappush(self._pending, (-hint.weight, self.searched, hint))
         return self.searched > before
@@ -224,6 +230,7 @@ class Search:
             return None
         view = self.small.match(pose)
         self.views += 1
+        self.poses_looked_from.append(pose)
         self._saw(view)
         return view.solution.T_map_camera if view.solution and view.inliers >= CONFIRMED_HINT else None
 

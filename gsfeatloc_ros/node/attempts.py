@@ -242,6 +242,7 @@ class Attempts:
         T_map_camera = trace.estimate.T_map_camera
         if job.shared and self.publishing:
             result = self._share(result, query, extrinsics, job.message.header)
+            publishers.publish_searched(trace, extrinsics, header)
             publishers.publish_pictures(trace, header)
         elif job.kept and not job.shared and T_map_camera is not None:
             self._follower.take_requested(query, header, T_map_camera)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from threading import Lock
@@ -95,6 +95,7 @@ class Publishers:
         self._candidates = node.create_publisher(
             PoseArray, "~/candidates", RELIABLE, qos_overriding_options=overridable()
         )
+        self._searched = node.create_publisher(PoseArray, "~/searched", RELIABLE, qos_overriding_options=overridable())
         self._changed = node.create_publisher(Image, "~/changed", RELIABLE, qos_overriding_options=overridable())
         self._timer = node.create_timer(_TRANSFORM_PERIOD, self._broadcast) if self._frames.odom else None
 
@@ -112,6 +113,7 @@ class Publishers:
             self._debug,
             self._changed,
             self._candidates,
+            self._searched,
         ):
             if publisher is not None:
                 self._node.destroy_publisher(publisher)
@@ -137,8 +139,7 @@ class Publishers:
 
     def candidates(self, estimate: Estimate, extrinsics: Extrinsics, header: Header) -> PoseArray:
         """Return the poses that explain the image of a header about equally well, of the body that answers are of."""
-        poses = [pose @ extrinsics.T_camera_body for pose in estimate.candidates]
-        return pose_array_message(poses, Header(stamp=header.stamp, frame_id=self._map_frame))
+        return self._poses(estimate.candidates, extrinsics, header)
 
     def publish_candidates(self, candidates: PoseArray) -> None:
         """Publish poses of which nobody knows which is the right one."""
@@ -167,6 +168,11 @@ class Publishers:
             self._T_map_odom = T_map_odom
             self._broadcast()
         return latency
+
+    def publish_searched(self, trace: Trace, extrinsics: Extrinsics, header: Header) -> None:
+        """Publish where the image of a header was looked for, if somebody subscribes."""
+        if self._searched.get_subscription_count() > 0:
+            self._searched.publish(self._poses(trace.searched, extrinsics, header))
 
     def publish_pictures(self, trace: Trace, header: Header) -> None:
         """Publish what there is to see of an image, each picture if somebody subscribes.
@@ -197,6 +203,11 @@ class Publishers:
     def forget(self) -> None:
         """Broadcast no more what follows from the last answer: time went back, or it is of another map."""
         self._T_map_odom = None
+
+    def _poses(self, poses: Sequence[np.ndarray], extrinsics: Extrinsics, header: Header) -> PoseArray:
+        """Return poses (4, 4) of the camera as those of the body that answers are of."""
+        of_body = [pose @ extrinsics.T_camera_body for pose in poses]
+        return pose_array_message(of_body, Header(stamp=header.stamp, frame_id=self._map_frame))
 
     def _broadcast(self) -> None:
         with self._broadcast_lock:

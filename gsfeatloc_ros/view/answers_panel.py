@@ -35,6 +35,8 @@ class AnswersPanel:
     def __init__(self, server: ViserServer, store: Store, renderer: Renderer, drawing: Drawing) -> None:
         self._store, self._renderer, self._drawing = store, renderer, drawing
         self._offset = 0
+        # What stands on the rows: more attempts may have come by the time that one is pressed.
+        self._shown: list[tuple[int, Attempt]] = []
         gui = self._gui = server.gui
         self._summary = gui.add_markdown("No image was tried yet.")
         self._only_without = gui.add_checkbox("Only those without an answer", False)
@@ -55,12 +57,11 @@ class AnswersPanel:
         if attempts:
             said = ", ".join(f"{count} {name}" for name, count in counts(attempts).items())
             self._summary.content = plain(f"{len(attempts)} images: {said}")
-        listed = self._listed()
-        for row, number in zip(self._rows, range(self._offset, self._offset + _ROWS), strict=True):
-            there = number < len(listed)
-            row.visible = there
-            if there:
-                place, attempt = listed[number]
+        self._shown = self._listed()[self._offset : self._offset + _ROWS]
+        for number, row in enumerate(self._rows):
+            row.visible = number < len(self._shown)
+            if row.visible:
+                place, attempt = self._shown[number]
                 row.label = f"{place}: {attempt.seconds} s, {attempt.status}"[:80]
                 row.color = COLOURS.get(attempt.status, GREY)
 
@@ -79,15 +80,16 @@ class AnswersPanel:
         self._choose(row, event.client)
 
     def _choose(self, row: int, client: ClientHandle | None) -> None:
-        listed = self._listed()
-        if self._offset + row >= len(listed):
+        shown = self._shown
+        if row >= len(shown):
             return
-        number, attempt = listed[self._offset + row]
+        number, attempt = shown[row]
         prior = self._store.prior(attempt.stamp)
         pose = prior if attempt.pose is None else attempt.pose
         self._details.content = self._words(number, attempt, prior is not None)
         self._drawing.chosen(attempt.pose)
         self._drawing.prior(prior)
+        self._drawing.searched(attempt.searched)
         picture = self._store.picture(attempt.stamp)
         camera = picture.camera if isinstance(picture, SmallPhoto) else _CAMERA
         if pose is not None and client is not None:

@@ -26,6 +26,7 @@ class Attempt:
         pose: (4, 4) T_map_camera; None where there is no answer.
         covariance: (6, 6) of it in ROS order; None where it is not known.
         candidates: (N, 4, 4) poses that explain it about equally well.
+        searched: (N, 4, 4) poses of the views of the map in which it was looked for; None where that is not known.
     """
 
     stamp: int
@@ -34,6 +35,7 @@ class Attempt:
     pose: np.ndarray | None = None
     covariance: np.ndarray | None = None
     candidates: np.ndarray | None = None
+    searched: np.ndarray | None = None
 
     @property
     def seconds(self) -> str:

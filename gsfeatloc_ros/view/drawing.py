@@ -25,8 +25,9 @@ COLOURS = {
 }
 GREY = (120, 120, 120)
 _PRIOR, _CHOSEN, _INDEX, _MARK = (250, 200, 20), (0, 190, 230), (110, 130, 170), (240, 30, 140)
-# Of a camera, as a share of the map's radius; of those of the index less: there are many.
-_CAMERA, _INDEX_CAMERA, _AXES, _MARK_SIZE = 0.04, 0.015, 0.08, 0.006
+_SEARCHED = (200, 120, 60)
+# Of a camera, as a share of the map's radius; of views of the map less: there are many.
+_CAMERA, _VIEW, _AXES, _MARK_SIZE = 0.04, 0.015, 0.08, 0.006
 # Ellipsoids of this share of the radius can be seen.
 _VISIBLE = 0.02
 # Cells of the floor over the map, about, and the most.
@@ -134,6 +135,7 @@ class Drawing:
         newest = attempts[-1].candidates if attempts else None
         candidates = [] if newest is None else list(newest)
         self._cameras("/candidates", candidates, _CAMERA, np.array(COLOURS["ambiguous"]))
+        self.searched(attempts[-1].searched if attempts else None)
 
     def visible_deviations(self, attempts: Sequence[Attempt]) -> float:
         """Return by how many standard deviations most ellipsoids can be seen: 1, 2, 5, 10 and so on."""
@@ -149,9 +151,13 @@ class Drawing:
         """Draw what was chosen among the answers, larger."""
         self._cameras("/chosen", [] if pose is None else [pose], 1.5 * _CAMERA, np.array(_CHOSEN))
 
+    def searched(self, poses: np.ndarray | None) -> None:
+        """Draw the views (N, 4, 4) in which an image was looked for."""
+        self._cameras("/searched", [] if poses is None else list(poses), _VIEW, np.array(_SEARCHED))
+
     def index(self, poses: Sequence[np.ndarray]) -> None:
         """Draw the views of the index."""
-        self._cameras("/index", poses, _INDEX_CAMERA, np.array(_INDEX))
+        self._cameras("/index", poses, _VIEW, np.array(_INDEX))
 
     def marks(self, points: Sequence[np.ndarray]) -> None:
         """Draw points (3,) that were clicked."""

@@ -19,6 +19,7 @@ _GROUPS = {
     "ellipsoids": ("Ellipsoids of the answers", True),
     "candidates": ("Candidates of the newest, if ambiguous", True),
     "prior": ("Prior", True),
+    "searched": ("Views in which the newest was looked for", True),
     "index": ("Views of the index", False),
 }
 

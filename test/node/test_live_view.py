@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from gsfeatloc_ros.client.client_node import ClientNode
-from gsfeatloc_ros.client.messages import pose_stamped, pose_with_covariance, rgb_image
-from gsfeatloc_ros.common.geometry import make_pose
+from gsfeatloc_ros.client.messages import camera_info_of, pose_stamped, pose_with_covariance, rgb_image
+from gsfeatloc_ros.common.geometry import invert, isotropic_covariance, make_pose
+from gsfeatloc_ros.view.prior_panel import base_facing
 from gsfeatloc_ros.view.store import Store
 
 POSE = make_pose(np.eye(3), [1.0, 2.0, 3.0])
@@ -64,8 +65,10 @@ def test_an_attempt_is_put_together_of_all_that_a_node_says_of_it(live, robot):
     poses = publisher(robot, PoseWithCovarianceStamped, "/robot/answers")
     poses.publish(elsewhere)
     poses.publish(answer)
-    candidates = PoseArray(header=answer.header, poses=[answer.pose.pose] * 2)
-    publisher(robot, PoseArray, "/robot/localizer/candidates").publish(candidates)
+    several = PoseArray(header=answer.header, poses=[answer.pose.pose] * 2)
+    publisher(robot, PoseArray, "/robot/localizer/candidates").publish(several)
+    several.poses.append(answer.pose.pose)
+    publisher(robot, PoseArray, "/robot/localizer/searched").publish(several)
     picture = rgb_image(np.full((4, 6, 3), 90, np.uint8))
     picture.header.stamp = stamp
     publisher(robot, Image, "/robot/debug_image").publish(picture)
@@ -74,12 +77,14 @@ def test_an_attempt_is_put_together_of_all_that_a_node_says_of_it(live, robot):
     other = DiagnosticStatus(name="other/localizer: localization", message="no", values=values)
     publisher(robot, DiagnosticArray, "/diagnostics").publish(DiagnosticArray(status=[other, said]))
     wait_for(lambda: store.attempts() and store.attempts()[0].status)
-    wait_for(lambda: store.attempts()[0].candidates is not None and store.picture(STAMP) is not None)
+    wait_for(lambda: store.attempts()[0].candidates is not None and store.attempts()[0].searched is not None)
+    wait_for(lambda: store.picture(STAMP) is not None)
     (attempt,) = store.attempts()
     assert (attempt.stamp, attempt.status, attempt.reason) == (STAMP, "ambiguous", "two places")
     np.testing.assert_allclose(attempt.pose, POSE)
     np.testing.assert_allclose(attempt.covariance, np.eye(6))
     assert attempt.candidates.shape == (2, 4, 4)
+    assert attempt.searched.shape == (3, 4, 4)
     np.testing.assert_allclose(store.prior(STAMP), POSE)
 
 
@@ -98,3 +103,44 @@ def test_priors_are_sent_as_rviz_does_and_of_the_camera(live, robot):
     assert got[0].header.frame_id == "map"
     assert got[0].pose.pose.position.y == 2.0
     assert got[0].pose.covariance[0] == 1.0
+
+
+def test_a_running_localizer_takes_the_prior_of_two_clicks_and_is_seen(tf, room_map_file, room_camera, photo):
+    """The base stands on the floor under the camera; its camera looks up or down, as the photo's does."""
+    from node_harness import connected_client, running_localizer
+    from tf2_msgs.msg import TFMessage
+    from transforms import transform_stamped
+
+    from gsfeatloc_ros.client.live import LiveNode
+    from gsfeatloc_ros.node.qos import LATCHED
+
+    T_map_camera, store = photo.T_map_camera, Store()
+    place = T_map_camera[:3, 3] * [1, 1, 0]
+    T_map_base = base_facing(place, place + T_map_camera[:3, 2])
+    with running_localizer(map__path=room_map_file) as process, connected_client() as client:
+        static = client.node.create_publisher(TFMessage, "/tf_static", LATCHED)
+        T_base_camera = invert(T_map_base) @ T_map_camera
+        mount = transform_stamped("base_link", "camera_optical", T_base_camera, client.next_stamp())
+        static.publish(TFMessage(transforms=[mount]))
+        client.send_camera_info(camera_info_of(room_camera))
+        live = LiveNode("localizer", "map", store)
+        try:
+            clicked = base_facing(place + np.array([0.2, -0.1, 0.0]), place + 3 * T_map_camera[:3, 2])
+            wait_for(lambda: "nobody" not in live.send_base(clicked, isotropic_covariance(0.3, 0.3)))
+            client.spin(0.5)
+            image = rgb_image(photo.image)
+            # Of the clock that stamps what is clicked.
+            image.header.stamp = client.node.get_clock().now().to_msg()
+            answer = client.attempt_as_stamped(image)
+            assert answer.ok, f"{answer.reason}\n{process.output}"
+            assert answer.values["prior"] == "initialpose"
+            stamp = 10**9 * image.header.stamp.sec + image.header.stamp.nanosec
+            wait_for(lambda: store.attempts() and store.attempts()[-1].covariance is not None)
+            wait_for(lambda: store.attempts()[-1].status and store.attempts()[-1].searched is not None)
+            wait_for(lambda: store.picture(stamp) is not None)
+        finally:
+            live.close()
+    seen = store.attempts()[-1]
+    assert (seen.stamp, seen.status) == (stamp, "localized")
+    np.testing.assert_allclose(seen.pose, T_map_camera, atol=0.02)
+    np.testing.assert_allclose(seen.searched[0], clicked @ T_base_camera, atol=1e-6)

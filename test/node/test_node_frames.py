@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from pathlib import Path
 
@@ -34,12 +33,6 @@ STAND_IN = sys.path[-1]
 HAS_TF2 = not tf2_ros.__file__.startswith(STAND_IN)
 T_ODOM_BASE = make_pose(so3_exp(np.array([0.0, 0.0, 1.2])), [3.0, -1.0, 0.0])
 ALIGNED = {"map__aligned": True, "publish_tf": True, "pose_frame": "base", "prior_frame": "base"}
-
-
-@pytest.fixture
-def tf(monkeypatch):
-    """Let the localizer find tf2_ros."""
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([os.environ["PYTHONPATH"], STAND_IN]))
 
 
 @pytest.fixture

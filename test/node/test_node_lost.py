@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import PoseArray
 from gsfeatloc_interfaces.srv import LocalizeImage
-from node_harness import TIMEOUT, Client, assert_close, connected_client, odometry, running_localizer
+from node_harness import TIMEOUT, Client, assert_close, connected_client, odometry, running_localizer, settle
 from std_srvs.srv import Empty
 
 from gsfeatloc_ros.client.messages import (
@@ -103,6 +104,25 @@ def start(client: Client, robot: Robot, photo: SimulatedPhoto) -> None:
     """Localize a photo by a prior."""
     client.send_prior(pose_stamped(photo.T_map_camera_prior))
     robot.find(photo, 1)
+
+
+def test_it_says_where_it_looked(client, far):
+    """Without a prior in views of the index, one of which sees what the photo shows; with one there first."""
+    heard = client.listen(PoseArray, "localizer/searched")
+    assert client.spin_until(lambda: client.node.count_publishers("localizer/searched") == 1, TIMEOUT)
+    settle(client)
+    image = rgb_image(far.image)
+    assert client.attempt(image).ok
+    assert client.spin_until(lambda: bool(heard), TIMEOUT)
+    assert stamp_of(heard[-1]) == stamp_of(image)
+    assert heard[-1].header.frame_id == "map"
+    centres = np.array([[pose.position.x, pose.position.y, pose.position.z] for pose in heard[-1].poses])
+    assert np.linalg.norm(centres - far.T_map_camera[:3, 3], axis=1).min() < 1.0
+    client.send_prior(pose_stamped(far.T_map_camera_prior))
+    assert client.attempt(rgb_image(far.image)).ok
+    assert client.spin_until(lambda: len(heard) > 1, TIMEOUT)
+    first = heard[-1].poses[0].position
+    np.testing.assert_allclose([first.x, first.y, first.z], far.T_map_camera_prior[:3, 3])
 
 
 def test_every_photo_is_found_without_a_prior(client, robot, room_photos):

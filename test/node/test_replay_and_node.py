@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-from pathlib import Path
-
 import numpy as np
 import pytest
 from bags import (
@@ -29,8 +26,6 @@ from gsfeatloc_ros.node.qos import LATCHED, RELIABLE, Topic
 from gsfeatloc_ros.simulate.bag_messages import CAMERA_FRAME
 from gsfeatloc_ros.tools.replay import main
 
-# Last: a tf2_ros that is installed comes before it.
-STAND_IN = str(Path(__file__).parents[1] / "support" / "tf2_stand_in")
 ODOM, TF, TF_STATIC = "/odom", "/tf", "/tf_static"
 OTHERS = (Topic(Odometry, ODOM, RELIABLE), Topic(TFMessage, TF, RELIABLE), Topic(TFMessage, TF_STATIC, LATCHED))
 PARAMETERS = {"track": True, "prior_frame": "base", "pose_frame": "base", "index.build": False, "matcher.name": "sift"}
@@ -57,7 +52,7 @@ def prior_of(photo, frame: str = "odom") -> tuple:
     return TOPICS["prior"], pose_stamped(photo.stamp, T_odom_base, frame)
 
 
-def test_answers_are_those_of_the_node(room_camera, room_photos, room_map_file, tmp_path, monkeypatch):
+def test_answers_are_those_of_the_node(room_camera, room_photos, room_map_file, tmp_path, tf):
     """With tf, odometry and one prior; where an image comes before its camera_info, and where a prior is unusable."""
     first, second, third, fourth = room_photos[:4]
     _, _, image, truth = recording(first, room_camera)
@@ -73,7 +68,6 @@ def test_answers_are_those_of_the_node(room_camera, room_photos, room_map_file, 
     bag = write_messages(tmp_path / "bag", messages)
     options = [text for name, value in PARAMETERS.items() for text in ("-p", f"{name}:={str(value).lower()}")]
     assert main(replay_arguments(bag, room_map_file, tmp_path / "out", "--odom", ODOM, *options)) == 0
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([os.environ.get("PYTHONPATH", ""), STAND_IN]))
     with running_localizer({"map.path": room_map_file, **PARAMETERS}, TOPICS | {"odom": ODOM}) as localizer:
         topics = Topics(**TOPICS, others=OTHERS)
         live = list(play_bag(bag, topics, is_running=lambda: localizer.alive))

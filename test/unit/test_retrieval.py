@@ -76,7 +76,7 @@ def test_photos_are_found_whichever_way_up_they_are(renderer, index, room_camera
         for taken in room_photos[:2]:
             photo = turned(Photo.undistorted(taken.image, room_camera, SEARCH_WIDTH), turns)
             truth = taken.T_map_camera @ make_pose(np.linalg.matrix_power(QUARTER, turns), np.zeros(3))
-            hints = [hint for hint in retrieve(Query(components, photo, StageClock()), anywhere) if hint]
+            hints = [hint for _, hint in retrieve(Query(components, photo, StageClock()), anywhere) if hint]
             best = max(hints, key=lambda hint: hint.inliers, default=None)
             found[upright] += best is not None and rotation_error_deg(best.pose, truth) < 5
     assert found[True] == 2
@@ -88,6 +88,6 @@ def test_views_that_were_looked_at_are_left_out(renderer, index, room_camera, ro
     components = Components(renderer, UprightSift(), create_tracker, LocalizerOptions(), index)
     photo = Photo.undistorted(room_photos[0].image, room_camera, SEARCH_WIDTH)
     query = Query(components, photo, StageClock())
-    every, rest = ([hint and hint.inliers for hint in retrieve(query, anywhere, n)] for n in (0, 20))
+    every, rest = ([hint and hint.inliers for _, hint in retrieve(query, anywhere, n)] for n in (0, 20))
     assert len(every) == 4 * len(index)
     assert rest == every[20:]
