@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from gsfeatloc_ros.align.alignment import Alignment
 from gsfeatloc_ros.align.fit import UndeterminedError
-from gsfeatloc_ros.align.floor import find_floor, surface_samples
 from gsfeatloc_ros.align.gravity import Up
 from gsfeatloc_ros.align.pairs import Answer
+from gsfeatloc_ros.inspect.floor import find_floor, surface_samples
 from gsfeatloc_ros.maps.gaussian_map import GaussianMap
 from gsfeatloc_ros.maps.similarity import Similarity
 
@@ -46,6 +46,8 @@ def level(up: Up, gaussians: GaussianMap, answers: Sequence[Answer], by_floor: b
         )
     cameras = np.array([answer.T_map_camera[:3, 3] for answer in answers])
     floor = find_floor(*surface_samples(gaussians), cameras, up.direction)
+    if floor is None:
+        raise UndeterminedError("the map has no level plane below the cameras: is what is up right?")
     tilt = float(np.degrees(np.arccos(np.clip(floor.normal @ up.direction, -1, 1))))
     S_robot_map = _standing(floor.normal if by_floor else up.direction, floor.point)
     heights = S_robot_map.transform(cameras)[:, 2]

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gsfeatloc_ros.inspect.floor import find_floor
 from gsfeatloc_ros.inspect.surfaces import Surfaces
 
 # Surfaces this close to level, or upright, count as that.
@@ -21,9 +22,10 @@ _MIN_LEVEL = 0.12
 # not. It is sure where the tops are so much more: (tops - undersides) / (tops + undersides).
 _MIDDLE = (0.1, 0.9)
 _MIN_EXCESS = 0.35
-# A floor or ceiling holds this share of what faces up, or down, within this share of the height on either side.
+# A floor holds this share of what faces up.
 _MIN_FLOOR_SHARE = 0.1
-_FLOOR_BAND = 0.02
+# It is looked for from so much above what faces up, as a share of the height of all.
+_ABOVE = 0.01
 # A ceiling is higher above the floor than this share of the height, and holds this share of what the floor does.
 _MIN_CEILING = 0.4
 _MIN_CEILING_SHARE = 0.3
@@ -69,8 +71,8 @@ def find_upright(surfaces: Surfaces) -> Upright | None:
     excess = (tops - undersides) / max(tops + undersides, 1)
     sign = 1.0 if excess >= 0 else -1.0
     level = float(np.mean(np.abs(cosines) > np.cos(_TOLERANCE)))
-    up, heights, cosines = sign * axis, sign * heights, sign * cosines
-    floor, ceiling = _floor_and_ceiling(heights, cosines, float(high - low))
+    up = sign * axis
+    floor, ceiling = _floor_and_ceiling(surfaces, up, float(high - low))
     return Upright(
         up=up.tolist(),
         level=level,
@@ -81,22 +83,33 @@ def find_upright(surfaces: Surfaces) -> Upright | None:
     )
 
 
-def _floor_and_ceiling(heights: np.ndarray, cosines: np.ndarray, height: float) -> tuple[float | None, float | None]:
-    """Return the heights of floor and ceiling, None for what is not there.
-
-    Args:
-        heights, cosines: (N,) of the surfaces along up, and of the angle of their normals to it.
-        height: of all of them.
-    """
-    band = _FLOOR_BAND * height
-    faces_up, faces_down = heights[cosines > np.cos(_TOLERANCE)], heights[cosines < -np.cos(_TOLERANCE)]
-    floor = _lowest(faces_up, band, max(_MIN_FLOOR_SHARE * len(faces_up), 3))
+def _floor_and_ceiling(surfaces: Surfaces, up: np.ndarray, height: float) -> tuple[float | None, float | None]:
+    """Return the heights of floor and ceiling along up (3,), None for what is not there; `height` is of all of them."""
+    cosines = surfaces.normals @ up
+    faces_up, faces_down = (surfaces.points[sign * cosines > np.cos(_TOLERANCE)] for sign in (1, -1))
+    floor = _lowest(faces_up, up, height, _MIN_FLOOR_SHARE * len(faces_up))
     if floor is None:
         return None, None
-    above = faces_down[faces_down > floor + _MIN_CEILING * height]
-    on_floor = np.sum(np.abs(faces_up - floor) <= band)
-    ceiling = _lowest(-above, band, max(_MIN_CEILING_SHARE * float(on_floor), 3))
-    return floor, None if ceiling is None else -ceiling
+    above = faces_down[faces_down @ up > floor[0] + _MIN_CEILING * height]
+    ceiling = _lowest(above, -up, height, _MIN_CEILING_SHARE * floor[1])
+    return floor[0], None if ceiling is None else -ceiling[0]
+
+
+def _lowest(points: np.ndarray, up: np.ndarray, height: float, count: float) -> tuple[float, float] | None:
+    """Return the height of the lowest large plane of points (n, 3), and how many are on it; None for less than `count`.
+
+    It is seen from above all of them, and from at least `height` above the lowest: planes are as thick everywhere.
+    """
+    if len(points) == 0:
+        return None
+    centre = points.mean(axis=0)
+    heights = points @ up
+    eye = max(heights.max() + _ABOVE * height, heights.min() + height)
+    above = centre + (eye - centre @ up) * up
+    floor = find_floor(points, np.ones(len(points)), above[None], up)
+    if floor is None or floor.share * len(points) < max(count, 3):
+        return None
+    return float(floor.point @ up), floor.share * len(points)
 
 
 def _axis(normals: np.ndarray) -> np.ndarray:
@@ -116,21 +129,6 @@ def _axis(normals: np.ndarray) -> np.ndarray:
         found = np.linalg.eigh(close.T @ close)[1][:, -1]
         axis = found * np.sign(found @ axis)
     return axis
-
-
-def _lowest(heights: np.ndarray, band: float, count: float) -> float | None:
-    """Return the lowest height about which, within `band`, `count` of the `heights` (n,) lie; None if there is none."""
-    if len(heights) == 0:
-        return None
-    ordered = np.sort(heights)
-    about = np.searchsorted(ordered, ordered + band) - np.searchsorted(ordered, ordered - band)
-    enough = np.flatnonzero(about >= count)
-    if len(enough) == 0:
-        return None
-    # Of those in its neighbourhood, the one with most.
-    near = enough[ordered[enough] <= ordered[enough[0]] + 2 * band]
-    best = ordered[near[np.argmax(about[near])]]
-    return float(np.median(ordered[np.abs(ordered - best) <= band]))
 
 
 def _half_sphere(count: int) -> np.ndarray:

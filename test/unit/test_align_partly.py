@@ -12,14 +12,18 @@ from bags import TOPICS, camera_info, image, write_messages
 from drives import random_similarity, write_tum
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from small_maps import one_gaussian
 
 from gsfeatloc_ros.align.fit import UndeterminedError
-from gsfeatloc_ros.align.floor import find_floor
+from gsfeatloc_ros.align.gravity import Up
+from gsfeatloc_ros.align.level import level
+from gsfeatloc_ros.align.pairs import Answer
 from gsfeatloc_ros.align.target import FAMILIES, Checkerboard, Tags, View
 from gsfeatloc_ros.align.target_fit import fit_targets, scale_by_targets
 from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.geometry import make_pose, quaternion_from_matrix, so3_exp
 from gsfeatloc_ros.common.parameter import settings_from
+from gsfeatloc_ros.inspect.floor import find_floor
 from gsfeatloc_ros.localize.settings import MapSettings
 from gsfeatloc_ros.maps.similarity import Similarity
 from gsfeatloc_ros.ros_io.parameter_file import read_parameter_file
@@ -60,20 +64,23 @@ def test_a_floor_is_found_below_a_table_whatever_the_unit(seed, unit):
 
 
 def test_without_gaussians_below_there_is_no_floor():
-    with pytest.raises(UndeterminedError, match="no Gaussians below"):
-        find_floor(np.zeros((0, 3)), np.zeros(0), np.ones((1, 3)), np.array([0, 0, 1.0]))
+    up = np.array([0, 0, 1.0])
+    assert find_floor(np.zeros((0, 3)), np.zeros(0), np.ones((1, 3)), up) is None
+    below = Answer(0, np.eye(4), np.zeros(2))
+    with pytest.raises(UndeterminedError, match="no level plane below the cameras"):
+        level(Up(up, 0.0, 1), one_gaussian([0, 0, 5.0], 0.1, 0.9), [below], by_floor=False, metres=False)
 
 
 @pytest.mark.parametrize("by", ["level", "imu"])
 def test_gravity_and_floor_level_the_map(by, room_map_file, room_photos, tmp_path, capsys):
     rng = np.random.default_rng(0)
     now = replace(random_similarity(rng), scale=1.3)
-    level = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    ahead = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
     cameras = [photo.T_map_camera for photo in room_photos]
     if by == "level":
         headings = np.linspace(0, 6, len(cameras))
         cameras = [
-            make_pose(so3_exp(np.array([0, 0, h])) @ level, T[:3, 3]) for h, T in zip(headings, cameras, strict=True)
+            make_pose(so3_exp(np.array([0, 0, h])) @ ahead, T[:3, 3]) for h, T in zip(headings, cameras, strict=True)
         ]
     answers = write_tum(tmp_path / "answers.tum", np.array([now.transform_pose(pose) for pose in cameras]))
     arguments = ["gravity", "--map", str(room_map_file), *where(now), "--answers", str(answers)]

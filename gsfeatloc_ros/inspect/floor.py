@@ -1,4 +1,4 @@
-"""The floor of a map: the lowest large plane of Gaussians below the cameras that is about level.
+"""The floor of a map: the lowest large plane of surfaces below the cameras that is about level.
 
 Maps may have more below it: what shiny floors reflect, or layers that fill holes.
 """
@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsfeatloc_ros.align.fit import UndeterminedError
 from gsfeatloc_ros.maps.gaussian_map import SOLID_OPACITY, GaussianMap
 
 # Gaussians looked at.
@@ -35,8 +34,8 @@ class Floor:
     Attributes:
         normal: (3,) up.
         point: (3,) on it, below the cameras.
-        residual: median distance of its Gaussians from it.
-        share: of the area of all Gaussians below the cameras.
+        residual: median distance of its surfaces from it.
+        share: of the area of all surfaces below the cameras.
     """
 
     normal: np.ndarray
@@ -54,23 +53,20 @@ def surface_samples(gaussians: GaussianMap) -> tuple[np.ndarray, np.ndarray]:
     return centres, widths[:, 1] * widths[:, 2] * gaussians.S_map_splat.scale**2
 
 
-def find_floor(points: np.ndarray, areas: np.ndarray, cameras: np.ndarray, up: np.ndarray) -> Floor:
-    """Find the floor.
+def find_floor(points: np.ndarray, areas: np.ndarray, cameras: np.ndarray, up: np.ndarray) -> Floor | None:
+    """Find the floor; None where there is nothing level below the cameras.
 
     Args:
         points: (N, 3) on surfaces.
         areas: (N,) that they stand for.
         cameras: (M, 3) above the floor.
         up: (3,) unit vector, right within some degrees.
-
-    Raises:
-        UndeterminedError: there is nothing level below the cameras.
     """
     camera_height = float(np.median(cameras @ up))
     below = points @ up < np.min(cameras @ up)
     points, areas = points[below], areas[below]
     if len(points) < 3:
-        raise UndeterminedError("the map has no Gaussians below the cameras: is what is up right?")
+        return None
     # One huge Gaussian is no plane.
     areas = np.minimum(areas, np.quantile(areas, 0.99))
     heights = points @ up
@@ -82,7 +78,7 @@ def find_floor(points: np.ndarray, areas: np.ndarray, cameras: np.ndarray, up: n
         if (plane := _plane_near(points, areas, up, height, size)) is not None
     ]
     if not found:
-        raise UndeterminedError("the map has no level plane below the cameras: is what is up right?")
+        return None
     largest = max(plane.share for plane in found)
     centre = cameras.mean(axis=0)
     candidates = [plane for plane in found if plane.share >= _LEAST_SHARE * largest]
