@@ -13,3 +13,5 @@ fi
 export NUMBA_CACHE_DIR=$VIRTUAL_ENV/numba_cache
 export FASTRTPS_DEFAULT_PROFILES_FILE=$_root/config/fastdds.xml
 unset _root
+# What `pip install` would put into .venv/bin.
+gsfeatloc() { python -m gsfeatloc_ros.tools.command "$@"; }

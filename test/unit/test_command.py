@@ -147,3 +147,12 @@ def test_words_are_completed(line, expected, tmp_path) -> None:
     run(_ARGCOMPLETE="1", COMP_LINE=line, COMP_POINT=point, _ARGCOMPLETE_STDOUT_FILENAME=str(answer), IFS="\v")
     words = answer.read_text().split("\v") if answer.exists() else []
     assert {word.strip() for word in words if word} == expected
+
+
+@pytest.mark.skipif(not (ROOT / ".venv/bin/activate").exists(), reason="it is of a clone that was set up")
+def test_the_environment_of_a_clone_has_the_command():
+    run = subprocess.run(
+        ["bash", "-c", ". scripts/env.sh && gsfeatloc --help"], cwd=ROOT, capture_output=True, text=True, timeout=120
+    )
+    assert run.returncode == 0, run.stderr
+    assert run.stdout.startswith("usage: gsfeatloc")
