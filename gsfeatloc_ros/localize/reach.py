@@ -15,9 +15,9 @@ from gsfeatloc_ros.render.base import Render
 _REACH = 0.12
 # What tracking in vain costs (a view is rendered anyway), as a share of what features cost when it is not.
 _COST = 0.15
-# A prior from which the photo is off by about this many pixels of the full picture is looked at in full size at once:
+# A prior from which the photo is off by no more than about this many pixels is looked at in full size at once:
 # one pass there costs less, then, than a small one before it.
-_SETTLED = 2.0
+_SETTLED = 4.0
 # Pixels across and down a render at which it is told how far the photo may be off.
 _GRID = (8, 6)
 
