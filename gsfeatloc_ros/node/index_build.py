@@ -59,7 +59,7 @@ class IndexBuild:
             nonlocal said
             if time.monotonic() >= said + _PROGRESS_PERIOD and not cancelled.is_set():
                 said = time.monotonic()
-                self._say(OK, f"building the view index: {done} of {total} views", engine, done)
+                self._say(OK, f"building the view index: looked from {done} of {total} places", engine, done)
 
         try:
             with self._cores.in_background():

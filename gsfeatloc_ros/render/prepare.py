@@ -57,8 +57,9 @@ def prepare(gaussian_map: GaussianMap, large: int = LARGE_MAP) -> PreparedMap:
     count = int(np.count_nonzero(seen))
     leaves = -(-count // CHUNK)
     chunks = int(level_starts(leaves, count > large)[-1])
+    gaussians = np.empty((chunks, ROWS, CHUNK), dtype=np.float32)
     prepared = PreparedMap(
-        gaussians=np.empty((chunks, ROWS, CHUNK), dtype=np.float32),
+        gaussians=gaussians,
         sh=np.empty((chunks, 3 * sh.shape[1], CHUNK), dtype=np.float16),
         low=np.empty((chunks, 3), dtype=np.float32),
         high=np.empty((chunks, 3), dtype=np.float32),
@@ -69,7 +70,7 @@ def prepare(gaussian_map: GaussianMap, large: int = LARGE_MAP) -> PreparedMap:
         reading=gaussian_map.reading,
     )
     # Sorted in the memory that the Gaussians then take: there is least to spare at this time.
-    keys = prepared.gaussians.reshape(-1).view(np.uint64)[:count]
+    keys = gaussians.reshape(-1).view(np.uint64)[:count]
     _list_seen(seen, keys)
     sample = keys[:: sample_step(count)]
     with KERNEL_LOCK:

@@ -57,8 +57,13 @@ class Building:
         """Return all rooms of a storey, so many Gaussians each, as one map."""
         rooms = range(number * ROOMS_OF_A_STOREY, min((number + 1) * ROOMS_OF_A_STOREY, self.rooms))
         parts = [self.part(room, gaussians, sh_degree) for room in rooms]
-        arrays = ("means", "scales", "rotations", "opacities", "sh")
-        return GaussianMap(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in arrays})
+        return GaussianMap(
+            means=np.concatenate([part.means for part in parts]),
+            scales=np.concatenate([part.scales for part in parts]),
+            rotations=np.concatenate([part.rotations for part in parts]),
+            opacities=np.concatenate([part.opacities for part in parts]),
+            sh=np.concatenate([part.sh for part in parts]),
+        )
 
     def pose(self, room: int, seed: int) -> np.ndarray:
         """Return a pose (4, 4) T_map_camera of a camera in a room that looks across it."""

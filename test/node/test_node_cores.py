@@ -40,7 +40,7 @@ def test_one_core_is_enough_whatever_it_does(room_map_file, room_camera, photo, 
     }
     taken = {}
     with running_localizer(**parameters) as process, connected_client() as client:
-        process.wait_for_output(r"building the view index: \d+ of \d+ views", START_TIMEOUT)
+        process.wait_for_output(r"building the view index: looked from \d+ of \d+ places", START_TIMEOUT)
         taken["index"] = cores(process, client)
         send_inputs(client, room_camera, photo)
         with running_camera(tmp_path / "picture.npy"):

@@ -18,7 +18,7 @@ def test_the_index_does_not_hold_up_the_node(room_map_file, room_camera, photo, 
     parameters = {"map__path": room_map_file, "index__path": tmp_path / "room.index", "index__views": 5000}
     parameters["index__build"] = True
     with running_localizer(**parameters) as process, connected_client() as client:
-        process.wait_for_output(r"building the view index: \d+ of \d+ views", TIMEOUT)
+        process.wait_for_output(r"building the view index: looked from \d+ of \d+ places", TIMEOUT)
         client.send_camera_info(camera_info_of(room_camera))
         without = client.attempt(rgb_image(photo.image))
         assert without.values["status"] == "failed"
