@@ -147,6 +147,13 @@ class Limits:
         (0.1, 1e6),
         live=True,
     )
+    max_focal_error: float = parameter(
+        0.05,
+        "An image in which a focal length that is off by more than this share would not show is no answer: the pose "
+        "might be off by as much. 1 where camera_info is known to be right.",
+        (0.01, 1.0),
+        live=True,
+    )
 
 
 def verdict(evidence: Evidence, limits: Limits) -> tuple[str, ...]:
@@ -159,6 +166,12 @@ def verdict(evidence: Evidence, limits: Limits) -> tuple[str, ...]:
         reasons.append(
             f"the focal length fits {abs(error):.1f} +- {sigma:.1f} % {'longer' if error > 0 else 'shorter'} than "
             "calibrated: is camera_info of this stream?"
+        )
+    elif camera_is_in_doubt(evidence, limits):
+        reasons.append(
+            f"a focal length that is {unseen_focal_error(evidence):.1%} off would not show in this image (at most "
+            f"{limits.max_focal_error:.1%}, localizer.max_focal_error): it shows too flat or too small a part of the "
+            "map"
         )
     if evidence.inliers < limits.min_inliers:
         reasons.append(f"{evidence.counts} (at least {limits.min_inliers} needed)")
@@ -227,7 +240,20 @@ def is_uncertain(evidence: Evidence, limits: Limits) -> bool:
 
 def focal_length_is_wrong(evidence: Evidence) -> bool:
     """Return whether the photo contradicts the focal length that was calibrated."""
-    return abs(evidence.focal_error) > _MAX_FOCAL_ERROR + _FOCAL_SIGMAS * evidence.focal_sigma
+    return abs(evidence.focal_error) > unseen_focal_error(evidence)
+
+
+def camera_is_in_doubt(evidence: Evidence, limits: Limits) -> bool:
+    """Return whether the photo contradicts the calibrated focal length, or could not contradict one that matters."""
+    return focal_length_is_wrong(evidence) or unseen_focal_error(evidence) > limits.max_focal_error
+
+
+def unseen_focal_error(evidence: Evidence) -> float:
+    """Return by what share a focal length may read as off without being wrong, NaN where that is not known.
+
+    It is large where a photo shows a plane from the front: nearer, or with a longer lens, that looks the same.
+    """
+    return _MAX_FOCAL_ERROR + _FOCAL_SIGMAS * evidence.focal_sigma
 
 
 def probability_wrong(evidence: Evidence) -> float:

@@ -24,8 +24,8 @@ from gsfeatloc_ros.localize.estimate import Estimate, Status, Trace
 from gsfeatloc_ros.localize.evidence import (
     Evidence,
     Limits,
+    camera_is_in_doubt,
     coverage,
-    focal_length_is_wrong,
     is_uncertain,
     probability_wrong,
     verdict,
@@ -157,7 +157,7 @@ class Localizer:
                 if candidate.believed:
                     best, rivals = self._best(query, candidate, search, prior)
                     return best.trace(query.photo, search, rivals)
-                if candidate.only_the_camera_is_wrong:
+                if candidate.only_the_camera_is_in_doubt(self._components.options.limits):
                     return candidate.trace(query.photo, search)
         except OutOfTime:
             return _out_of_time(query, search, likeliest)
@@ -299,10 +299,9 @@ class _Candidate:
         """Whether nothing speaks against it."""
         return not self.reasons_against
 
-    @property
-    def only_the_camera_is_wrong(self) -> bool:
-        """Whether nothing but the camera's calibration speaks against it: no other view would help."""
-        return len(self.reasons_against) == 1 and focal_length_is_wrong(self.evidence)
+    def only_the_camera_is_in_doubt(self, limits: Limits) -> bool:
+        """Return whether nothing but the camera's calibration speaks against it: no other view would help."""
+        return len(self.reasons_against) == 1 and camera_is_in_doubt(self.evidence, limits)
 
     def against_mirror(self, mirror_probability_wrong: float, limits: Limits) -> _Candidate:
         """Return the candidate judged with what is known of the photo's mirror image."""

@@ -124,6 +124,18 @@ def test_a_probability_that_cannot_be_said_is_a_reason() -> None:
     assert "probability of nan" in reason
 
 
+def test_a_photo_that_would_not_show_a_wrong_focal_length_is_no_answer() -> None:
+    """A wall from the front looks the same from nearer by a shorter lens; 1 % and 1.5 times 2.67 % are 5 %."""
+    assert verdict(replace(GOOD, focal_error=0.0, focal_sigma=0.026), Limits()) == ()
+    flat = replace(GOOD, focal_error=0.0, focal_sigma=0.03)
+    (reason,) = verdict(flat, Limits())
+    assert "a focal length that is 5.5% off would not show in this image (at most 5.0%" in reason
+    assert verdict(flat, Limits(max_focal_error=1.0)) == ()
+    # What the photo does contradict is told alone.
+    (reason,) = verdict(replace(flat, focal_error=-0.1), Limits())
+    assert "the focal length fits 10.0 +- 3.0 % shorter" in reason
+
+
 def test_a_camera_that_cannot_be_fitted_is_none() -> None:
     assert verdict(replace(GOOD, focal_error=float("nan"), focal_sigma=float("nan")), Limits()) == ()
 
