@@ -119,7 +119,7 @@ def test_frames_of_a_map(map_file, tmp_path):
     assert report["coverage"] == pytest.approx(expected.alpha.mean(), abs=2e-3)
     for times in (report["cpu_ms"], report["wall_ms"]):
         assert 0 < times["min"] <= times["median"]
-    assert list(report["stages_cpu_ms"]) == ["cull", "project", "scatter", "sort and blend"]
+    assert list(report["stages_cpu_ms"]) == ["cull", "read", "project", "scatter", "sort and blend"]
     assert report["load"]["cold"]["seconds"] > report["load"]["from_cache"]["seconds"] > 0
     # 59 numbers of 4 bytes.
     assert report["parameters_mb"] == pytest.approx(20000 * 59 * 4 / 2**20, abs=0.1)

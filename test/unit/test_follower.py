@@ -71,7 +71,7 @@ def test_found_without_a_prior_and_followed():
     np.testing.assert_allclose(query.T_map_camera_prior, along(4), atol=1e-9)
     # It may be anywhere near, but is by 2 metres of odometry, of which a tenth may be wrong, from an answer.
     usual = robot.follower.options(LocalizerOptions(), image(104).header, query).search.usual_covariance
-    assert np.sqrt(usual[0, 0]) == pytest.approx(np.hypot(0.01, 0.2))
+    assert np.sqrt(usual[0, 0]) == pytest.approx(np.hypot(0.003, 0.2))
     assert query.prior_covariance[0, 0] > usual[0, 0]
 
 
