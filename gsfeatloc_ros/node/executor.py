@@ -92,7 +92,8 @@ class GuardedExecutor(SingleThreadedExecutor):
 
         async def answer_all() -> None:
             for taken in requests:
-                self.create_task(self._guarded(partial(answer, *taken)))
+                # Begun here, in the order in which they came: the executor takes the newest task first.
+                self.create_task(self._guarded(partial(answer, *taken)))()
 
         return answer_all if requests else None
 

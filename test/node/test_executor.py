@@ -11,7 +11,7 @@ from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from rclpy.qos import HistoryPolicy, QoSProfile
-from std_srvs.srv import Trigger
+from std_srvs.srv import SetBool, Trigger
 
 from gsfeatloc_ros.node import executor as executor_module
 from gsfeatloc_ros.node.executor import GuardedExecutor, HopelessError
@@ -107,6 +107,34 @@ def test_of_requests_that_come_together_each_is_answered_once_and_timers_run_bet
         assert not failures
         # They did not all come first.
         assert len(set(served)) > 1
+
+
+@pytest.mark.parametrize("asynchronous", [False, True])
+def test_requests_that_come_together_are_begun_in_their_order(asynchronous: bool):
+    """Of two transitions of a lifecycle the second may need the first."""
+    begun = []
+
+    def serve(request, response):
+        begun.append(request.data)
+        return response
+
+    async def serve_later(request, response):
+        serve(request, response)
+        await wait
+        return response
+
+    with guarded_node() as (node, executor, failures):
+        wait = rclpy.task.Future()
+        node.create_service(SetBool, "serve", serve_later if asynchronous else serve)
+        client = node.create_client(SetBool, "serve")
+        spin_until(executor, client.service_is_ready)
+        order = [True, False, False, True, False, True, True, False]
+        answers = [client.call_async(SetBool.Request(data=data)) for data in order]
+        spin_until(executor, lambda: len(begun) == len(order))
+        wait.set_result(None)
+        spin_until(executor, lambda: all(answer.done() for answer in answers))
+        assert begun == order
+        assert not failures
 
 
 def test_a_request_that_cannot_be_taken_costs_no_other(monkeypatch):
