@@ -10,7 +10,9 @@ from numba.core import event
 
 from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.localize.estimate import Estimate
+from gsfeatloc_ros.localize.evidence import Limits
 from gsfeatloc_ros.localize.localizer import Localizer
+from gsfeatloc_ros.localize.options import LocalizerOptions
 from gsfeatloc_ros.maps.gaussian_map import SH_COEFFICIENTS, GaussianMap
 from gsfeatloc_ros.match import Matcher
 from gsfeatloc_ros.render import create_renderer
@@ -54,7 +56,9 @@ def warm_up(matcher: Matcher | None = None, device: str = "auto", threads: int =
                 renderer = create_renderer(_wall(coefficients, antialiased), device, threads)
                 photo = renderer.render(_CAMERA, np.eye(4)).image()
     rendered = time.perf_counter()
-    estimate = None if matcher is None else Localizer(renderer, matcher).localize(photo, _CAMERA, np.eye(4))
+    # A wall from the front would not show a wrong focal length.
+    options = LocalizerOptions(limits=Limits(max_focal_error=1.0))
+    estimate = None if matcher is None else Localizer(renderer, matcher, options).localize(photo, _CAMERA, np.eye(4))
     return WarmUp(
         compiled=sum(event_.is_start for _, event_ in compilations.buffer),
         kernels_seconds=rendered - start,

@@ -521,7 +521,7 @@ def test_flipped_bytes(tmp_path, samples, name, data):
     for at, value in data.draw(st.lists(st.tuples(position, st.integers(0, 255)), min_size=1, max_size=4)):
         content[at] = value
     (tmp_path / "map").write_bytes(content)
-    check_damaged(tmp_path / "map", 4e6)
+    check_damaged(tmp_path / "map", 8e6)
 
 
 @pytest.mark.parametrize("version", [1, 2, 3])
