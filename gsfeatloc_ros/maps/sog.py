@@ -133,6 +133,9 @@ def _read_member(path: Path, archive: zipfile.ZipFile, name: str, limit: int = M
         raise MapError(f"{path}: {name} is compressed in a way that a .sog is not: zip it with deflate or without")
     if member.file_size > limit:
         raise MapError(f"{path}: is damaged: {name} claims {member.file_size} bytes, which is too many for a .sog")
+    # So much memory is taken to read it, and so much it may unpack to.
+    if member.compress_size > path.stat().st_size:
+        raise MapError(f"{path}: is truncated or damaged: {name} claims to take {member.compress_size} bytes of it")
     check_compression(path, member.file_size, member.compress_size)
     return archive.read(member)
 

@@ -521,7 +521,20 @@ def test_flipped_bytes(tmp_path, samples, name, data):
     for at, value in data.draw(st.lists(st.tuples(position, st.integers(0, 255)), min_size=1, max_size=4)):
         content[at] = value
     (tmp_path / "map").write_bytes(content)
-    check_damaged(tmp_path / "map", 8e6)
+    check_damaged(tmp_path / "map", 4e6)
+
+
+@pytest.mark.parametrize("claim", [2**16, 2**22, 2**32 - 2])
+def test_a_sog_whose_file_claims_more_than_there_is_takes_no_memory(tmp_path, samples, claim):
+    content = bytearray(samples["sog 2"])
+    # In the zip's directory the compressed size is 20 bytes after an entry begins.
+    at = content.index(b"PK\x01\x02") + 20
+    content[at : at + 4] = claim.to_bytes(4, "little")
+    path = tmp_path / "map"
+    path.write_bytes(content)
+    check_damaged(path, 1e6)
+    with pytest.raises(MapError, match=f"claims to take {claim} bytes"):
+        load_map(path)
 
 
 @pytest.mark.parametrize("version", [1, 2, 3])
