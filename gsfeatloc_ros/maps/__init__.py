@@ -67,12 +67,9 @@ def load_map(
     Raises:
         MapError: the file cannot be used; the message names it, what is wrong and what to do.
     """
-    bundle = read_bundle(path)
-    if bundle is not None:
-        bundle.check_map()
-    path = Path(path) if bundle is None else bundle.map
+    path = _map_of(path)
     gaussian_map = gather_map(path, options, to_gaussian_map)
-    check_seen(path, gaussian_map.opacities)
+    check_seen(path, len(gaussian_map), gaussian_map.highest_opacity)
     return gaussian_map if alignment is None else gaussian_map.placed(alignment)
 
 
@@ -91,15 +88,24 @@ def look_through(
     Raises:
         MapError: the file cannot be used; parts may have been looked at by then.
     """
-    bundle = read_bundle(path)
-    if bundle is not None:
-        bundle.check_map()
 
     def gather(path: Path, layout: Layout, blocks: Iterable[Block], options: ReadOptions) -> None:
+        count, most = 0, 0.0
         for part in parts(path, layout, blocks, options):
+            count, most = count + len(part), max(most, part.highest_opacity)
             look(part if alignment is None else part.placed(alignment))
+        check_seen(path, count, most)
 
-    gather_map(Path(path) if bundle is None else bundle.map, options, gather)
+    gather_map(_map_of(path), options, gather)
+
+
+def _map_of(path: str | Path) -> Path:
+    """Return the path of a map, that of the one in a bundle after a look whether it is whole."""
+    bundle = read_bundle(path)
+    if bundle is None:
+        return Path(path)
+    bundle.check_map()
+    return bundle.map
 
 
 def gather_map(path: Path, options: ReadOptions, gather: Gather[T]) -> T:
@@ -125,12 +131,11 @@ def gather_map(path: Path, options: ReadOptions, gather: Gather[T]) -> T:
         raise MapError(f"{path}: does not fit into this machine's memory: crop or thin the map") from error
 
 
-def check_seen(path: Path, opacities: np.ndarray) -> None:
-    """Raise MapError where none of the Gaussians of a map can be seen, by their opacities (N,)."""
-    most = float(opacities.max(initial=0.0))
+def check_seen(path: Path, count: int, most: float) -> None:
+    """Raise MapError where none of the `count` Gaussians of a map can be seen, by the highest opacity of them."""
     if most < _MIN_OPACITY:
         raise MapError(
-            f"{path}: nothing in it can be seen: none of its {len(opacities)} Gaussians has an opacity of more than "
+            f"{path}: nothing in it can be seen: none of its {count} Gaussians has an opacity of more than "
             f"{most:.2g}; was its training, or its export, broken off?"
         )
 

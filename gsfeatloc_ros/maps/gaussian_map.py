@@ -65,6 +65,11 @@ class GaussianMap:
     def __len__(self) -> int:
         return len(self.means)
 
+    @property
+    def highest_opacity(self) -> float:
+        """Opacity of the most opaque Gaussian; 0 without any."""
+        return float(self.opacities.max(initial=0.0))
+
     def placed(self, S_map_file: Similarity) -> GaussianMap:
         """Return the same where the frame of its file lies elsewhere in the robot's map frame."""
         return replace(self, S_map_splat=S_map_file @ self.S_map_splat)

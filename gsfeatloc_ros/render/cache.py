@@ -80,7 +80,7 @@ def _prepared(path: Path, options: ReadOptions, cache_path: Path, origin: dict[s
             if prepared is not None:
                 return prepared
         found = gather_map(path, options, assemble)
-    check_seen(path, found.opacities)
+    check_seen(path, len(found), found.highest_opacity)
     prepared = prepare(found)
     _write_if_possible(cache_path, prepared, origin)
     return prepared

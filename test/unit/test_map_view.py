@@ -150,6 +150,12 @@ def test_a_map_that_cannot_be_used_is_refused_part_by_part(tmp_path):
         look_through(tmp_path / "map.ply", lambda part: None)
 
 
+def test_a_map_of_which_nothing_can_be_seen_is_refused_part_by_part(tmp_path):
+    write_ply(tmp_path / "map.ply", replace(made(np.zeros((10, 3))), opacities=np.full(10, 1e-3, np.float32)))
+    with pytest.raises(MapError, match="nothing in it can be seen: none of its 10 Gaussians"):
+        look_through(tmp_path / "map.ply", lambda part: None)
+
+
 def test_a_slice_without_height_is_refused():
     with pytest.raises(ValueError, match=r"map\.occupancy_max_height is 0\.1: it must be above"):
         Slice(0.1, 0.1, 0.05)
