@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from io import FileIO
 from typing import BinaryIO
 
@@ -34,22 +34,21 @@ class StoredFile:
 
     def read(self, offset: int, parts: list[np.ndarray]) -> None:
         """Fill contiguous arrays with what is in the file from `offset` on; raise OSError where that fails."""
-        for first in range(0, len(parts), _PARTS):
-            some = [part.data for part in parts[first : first + _PARTS]]
-            size = sum(part.nbytes for part in some)
-            if os.preadv(self._file.fileno(), some, offset) != size:
-                raise OSError("was cut short")
-            offset += size
+        self._transfer(os.preadv, offset, parts, "was cut short")
         if self._stamp is not None and _stamp(os.fstat(self._file.fileno())) != self._stamp:
             raise OSError("was changed while it was in use")
 
     def write(self, offset: int, parts: list[np.ndarray]) -> None:
         """Write contiguous arrays one after another from `offset` on; raise OSError where that fails."""
+        self._transfer(os.pwritev, offset, parts, "there is no room for it")
+
+    def _transfer(self, transfer: Callable[..., int], offset: int, parts: list[np.ndarray], otherwise: str) -> None:
+        """Read or write by a call of the system; raise OSError, where that does less, with what is so otherwise."""
         for first in range(0, len(parts), _PARTS):
             some = [part.data for part in parts[first : first + _PARTS]]
             size = sum(part.nbytes for part in some)
-            if os.pwritev(self._file.fileno(), some, offset) != size:
-                raise OSError("there is no room for it")
+            if transfer(self._file.fileno(), some, offset) != size:
+                raise OSError(otherwise)
             offset += size
 
 
