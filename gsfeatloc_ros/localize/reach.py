@@ -33,12 +33,12 @@ def is_worth_tracking(render: Render, camera: Camera, prior: Prior) -> bool:
 
 
 def may_be_settled(camera: Camera, prior: Prior) -> bool:
-    """Return whether a photo may be where its prior is, to a pixel or two, by what the prior knows of the rotation."""
+    """Return whether a photo may be within _SETTLED pixels of its prior, by what that knows of the rotation alone."""
     return bool(camera.K[0, 0] * np.sqrt(np.trace(prior.usual_covariance[3:, 3:]) / 3) <= _SETTLED)
 
 
 def is_settled(render: Render, camera: Camera, prior: Prior) -> bool:
-    """Return whether a photo usually is where its prior is, to a pixel or two, by the full-size render there."""
+    """Return whether a photo usually is within _SETTLED pixels of its prior, by the full-size render there."""
     return expected_offset(render, camera, prior) <= _SETTLED
 
 

@@ -229,15 +229,12 @@ def refine_pose(
         return None
     whitening = _whitening(linear.projected - found.pixels, _apply(linear.by_point, found.sigmas))
 
-    def equations_of(linear: Linear) -> NormalEquations:
+    def with_cost(linear: Linear) -> tuple[NormalEquations, float]:
         residuals = linear.projected - found.pixels
-        return normal_equations(whitening, residuals, linear.by_state, POSE_PARAMETERS, options.cauchy_scale)
+        equations = normal_equations(whitening, residuals, linear.by_state, POSE_PARAMETERS, options.cauchy_scale)
+        return equations, float(np.log1p(equations.squared / options.cauchy_scale**2).sum())
 
-    def cost(equations: NormalEquations) -> float:
-        return float(np.log1p(equations.squared / options.cauchy_scale**2).sum())
-
-    equations = equations_of(linear)
-    current = cost(equations)
+    equations, current = with_cost(linear)
     for _ in range(_REFINE_ITERATIONS):
         hessian = equations.hessian
         try:
@@ -246,8 +243,8 @@ def refine_pose(
             return None
         candidate = moved(pose, step)
         linear_there = linearize(camera, candidate, found.points)
-        equations_there = equations_of(linear_there) if linear_there else None
-        if linear_there is None or equations_there is None or (cost_there := cost(equations_there)) > current:
+        equations_there, cost_there = with_cost(linear_there) if linear_there else (equations, np.inf)
+        if linear_there is None or cost_there > current:
             damping *= 10
             continue
         converged = current - cost_there <= _CONVERGED * current
