@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -12,11 +14,11 @@ from node_harness import running_localizer
 from rclpy.lifecycle import LifecycleNode
 from rclpy.node import Node, NodeNameNonExistentError
 
+from gsfeatloc_ros.client.client_node import TIMEOUT
+
 PAGE = (Path(__file__).parents[2] / "docs/topics-and-services.md").read_text(encoding="utf-8")
 # tf2_ros makes it, where publish_tf asks for it.
 OF_TF = {"/tf": "tf2_msgs/TFMessage"}
-# Seconds.
-DISCOVERY = 10.0
 
 Names = dict[str, str]
 
@@ -41,19 +43,22 @@ def named(node: Node, kind: str, name: str) -> Names:
     return {topic: short(only) for topic, (only,) in found}
 
 
-@pytest.fixture(scope="module")
-def bare():
-    """A node that has what any lifecycle node has; one: of a second of its name, rclpy loses sight of /rosout."""
+@contextmanager
+def bare_node(name: str) -> Iterator[Node]:
+    """A node that has what any lifecycle node has, in a context of its own that knows no earlier localizer.
+
+    Its name must be new to this process: of a second node of the same name, rclpy loses sight of /rosout.
+    """
     context = rclpy.Context()
     rclpy.init(context=context)
-    node = LifecycleNode("bare", context=context)
+    node = LifecycleNode(name, context=context)
     yield node
     node.destroy_node()
     rclpy.shutdown(context=context)
 
 
 @pytest.mark.parametrize(("transport", "image"), [("raw", "/image"), ("compressed", "/image/compressed")])
-def test_the_page_names_all_that_the_node_has(bare, room_map_file, transport, image):
+def test_the_page_names_all_that_the_node_has(room_map_file, transport, image):
     """And what any lifecycle node has. Without track and map.aligned there is neither odometry nor ~/occupancy."""
     subscribed, published = table("subscribes"), table("publishes")
     assert OF_TF.items() <= published.items()
@@ -64,14 +69,16 @@ def test_the_page_names_all_that_the_node_has(bare, room_map_file, transport, im
         "service": table("service"),
     }
 
-    def expected(kind: str) -> Names:
-        of_any = named(bare, kind, "bare")
-        return listed[kind] | {name.replace("/bare/", "/localizer/"): of for name, of in of_any.items()}
+    name = f"bare_{transport}"
+
+    def expected(bare: Node, kind: str) -> Names:
+        of_any = named(bare, kind, name)
+        return listed[kind] | {topic.replace(f"/{name}/", "/localizer/"): of for topic, of in of_any.items()}
 
     parameters = {"track": True, "map__aligned": True, "image__transport": transport}
-    with running_localizer(map__path=room_map_file, **parameters):
+    with running_localizer(map__path=room_map_file, **parameters), bare_node(name) as bare:
         for kind in listed:
-            deadline = time.monotonic() + DISCOVERY
-            while named(bare, kind, "localizer") != expected(kind) and time.monotonic() < deadline:
+            deadline = time.monotonic() + TIMEOUT
+            while named(bare, kind, "localizer") != expected(bare, kind) and time.monotonic() < deadline:
                 time.sleep(0.1)
-            assert named(bare, kind, "localizer") == expected(kind)
+            assert named(bare, kind, "localizer") == expected(bare, kind)
