@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from concurrent.futures import Future
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -21,6 +23,21 @@ _REST = 0.1
 
 class HopelessError(RuntimeError):
     """All that the executor does fails, again and again."""
+
+
+@dataclass(frozen=True)
+class Later:
+    """What the callback of a service returns in place of a response that is not there yet.
+
+    rclpy would have it be a coroutine, and runs each that waits a bit further whenever anything at all comes.
+
+    Attributes:
+        done: when this is, the response can be made.
+        make: makes it, in the executor's thread.
+    """
+
+    done: Future[Any]
+    make: Callable[[], Any]
 
 
 class GuardedExecutor(SingleThreadedExecutor):
@@ -86,9 +103,16 @@ class GuardedExecutor(SingleThreadedExecutor):
         except Exception as error:
             self._fail(error)
 
+        async def send(make: Callable[[], Any], header: Any) -> None:
+            service.send_response(make(), header)
+
         async def answer(request: Any, header: Any) -> None:
             response = await await_or_execute(service.callback, request, service.srv_type.Response())
-            service.send_response(response, header)
+            if isinstance(response, Later):
+                task = self._guarded(partial(send, response.make, header))
+                response.done.add_done_callback(lambda _: self.create_task(task))
+            else:
+                service.send_response(response, header)
 
         async def answer_all() -> None:
             for taken in requests:

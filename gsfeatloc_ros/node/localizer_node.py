@@ -61,6 +61,8 @@ def _logged(transition: _Transition) -> _Transition:
 class LocalizerNode(LifecycleNode):
     """A lifecycle node: configured, it has loaded the map; active, it listens, publishes and answers requests.
 
+    It is for a GuardedExecutor: others cannot send what its services answer later.
+
     Args:
         go_on: is asked again and again while a map is loaded whether to go on waiting for it.
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from concurrent.futures import CancelledError, Future
+from functools import partial
 from typing import Any
 
-import rclpy.task
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
@@ -15,6 +15,7 @@ from std_srvs.srv import Empty, Trigger
 
 from gsfeatloc_ros.common.stage_clock import Interrupted
 from gsfeatloc_ros.node.attempts import Job, JobResult
+from gsfeatloc_ros.node.executor import Later
 from gsfeatloc_ros.node.interfaces import LocalizeImage
 from gsfeatloc_ros.node.qos import IMAGE_REQUESTS, REQUESTS
 from gsfeatloc_ros.node.session import Session
@@ -60,11 +61,14 @@ class Services:
         else:
             self._create(LocalizeImage, "~/localize_image", self._on_localize_image, IMAGE_REQUESTS)
 
-    async def _on_relocalize(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _on_relocalize(self, request: Trigger.Request, response: Trigger.Response) -> Later:
         """Localize the newest image."""
-        result = await self._result("~/relocalize", lambda session: session.reception.newest())
-        response.success, response.message = result.answer is not None, result.outcome.reason
-        return response
+
+        def fill(result: JobResult) -> Trigger.Response:
+            response.success, response.message = result.answer is not None, result.outcome.reason
+            return response
+
+        return self._later("~/relocalize", lambda session: session.reception.newest(), fill)
 
     def _on_reinitialize(self, request: Empty.Request, response: Empty.Response) -> Empty.Response:
         """Forget where the robot is."""
@@ -75,31 +79,11 @@ class Services:
             session.lose("asked for by reinitialize_global_localization")
         return response
 
-    async def _on_localize_image(self, request: Any, response: Any) -> Any:
+    def _on_localize_image(self, request: Any, response: Any) -> Later:
         """Localize the image of a LocalizeImage."""
-        result = await self._result("~/localize_image", lambda session: _requested_job(request, session))
-        outcome, answer = result.outcome, result.answer
-        response.status = {
-            OutcomeStatus.LOCALIZED: response.LOCALIZED,
-            OutcomeStatus.REJECTED: response.REJECTED,
-            OutcomeStatus.FAILED: response.FAILED,
-            OutcomeStatus.REFUSED: response.REFUSED,
-            OutcomeStatus.BUSY: response.BUSY,
-            OutcomeStatus.ERROR: response.ERROR,
-            OutcomeStatus.AMBIGUOUS: response.AMBIGUOUS,
-        }[outcome.status]
-        response.reason = outcome.reason
-        response.probability_wrong = response.protection_radius = response.protection_angle = math.nan
-        if outcome.estimate is not None:
-            response.inliers = outcome.estimate.evidence.inliers
-            response.milliseconds = outcome.estimate.milliseconds["total"]
-            response.probability_wrong = outcome.estimate.evidence.probability_wrong
-        if result.candidates is not None:
-            response.candidates = result.candidates
-        if answer is not None:
-            response.pose = answer.pose
-            response.protection_radius, response.protection_angle = answer.protection.radius, answer.protection.angle
-        return response
+        return self._later(
+            "~/localize_image", lambda session: _requested_job(request, session), partial(_filled, response)
+        )
 
     def _active_session(self) -> Session:
         session = self._session()
@@ -112,37 +96,35 @@ class Services:
     def _create(self, service_type: type, name: str, callback: Callable[[Any, Any], Any], qos: QoSProfile) -> None:
         self._node.create_service(service_type, name, callback, qos_profile=qos, callback_group=self._group)
 
-    async def _result(self, service: str, make: Callable[[Session], Job]) -> JobResult:
-        """Return what comes of the job that a request to a service makes; whatever happens, there is an answer."""
+    def _later(self, service: str, make: Callable[[Session], Job], fill: Callable[[JobResult], Any]) -> Later:
+        """Request the job that a request to a service makes, and return the response that is filled when it is done."""
+        self.unanswered += 1
         try:
             session = self._active_session()
             done = session.attempts.request(make(session), session.settings.requests, lambda: self._has_client(service))
-            return await self._await(done)
+        except Exception as error:
+            done = Future()
+            done.set_exception(error)
+        return Later(done, lambda: fill(self._result(service, done)))
+
+    def _result(self, service: str, done: Future[JobResult]) -> JobResult:
+        """Return what came of a job that was requested of a service; whatever happened, there is an answer."""
+        self.unanswered -= 1
+        try:
+            return done.result()
         except ValueError as error:
             return JobResult(Outcome.refused(error))
         except UnservedError as error:
             outcome = Outcome.busy(f"{error}: ask again later, or less often (parameters requests.*)")
-            session.report.count_unserved(service, outcome.reason)
+            session = self._session()
+            if session is not None:
+                session.report.count_unserved(service, outcome.reason)
             return JobResult(outcome)
         except (CancelledError, Interrupted):
             return JobResult(Outcome.refused("the node is stopping"))
         except Exception as error:
             self._on_failure(error)
             return JobResult(Outcome.error(error))
-
-    async def _await(self, done: Future[JobResult]) -> JobResult:
-        """Wait for the worker, without holding up the executor."""
-        if done.done():
-            return done.result()
-        answer, executor = rclpy.task.Future(), self._node.executor
-        assert executor is not None  # this is run by it
-        self.unanswered += 1
-        # Setting the answer in a task wakes the executor, which then resumes this coroutine.
-        done.add_done_callback(lambda done: executor.create_task(answer.set_result, done))
-        finished = await answer
-        self.unanswered -= 1
-        result: JobResult = finished.result()
-        return result
 
     def _has_client(self, service: str) -> bool:
         """Return whether there is any client of a service; rclpy does not tell whose a request is."""
@@ -162,3 +144,29 @@ def _requested_job(request: Any, session: Session) -> Job:
     inputs = session.inputs.newest()
     kept = not request.forget
     return Job(request.image, camera, prior, inputs, shared=False, kept=kept, max_seconds=request.max_seconds)
+
+
+def _filled(response: Any, result: JobResult) -> Any:
+    """Return the response of a LocalizeImage, filled with what came of its job."""
+    outcome, answer = result.outcome, result.answer
+    response.status = {
+        OutcomeStatus.LOCALIZED: response.LOCALIZED,
+        OutcomeStatus.REJECTED: response.REJECTED,
+        OutcomeStatus.FAILED: response.FAILED,
+        OutcomeStatus.REFUSED: response.REFUSED,
+        OutcomeStatus.BUSY: response.BUSY,
+        OutcomeStatus.ERROR: response.ERROR,
+        OutcomeStatus.AMBIGUOUS: response.AMBIGUOUS,
+    }[outcome.status]
+    response.reason = outcome.reason
+    response.probability_wrong = response.protection_radius = response.protection_angle = math.nan
+    if outcome.estimate is not None:
+        response.inliers = outcome.estimate.evidence.inliers
+        response.milliseconds = outcome.estimate.milliseconds["total"]
+        response.probability_wrong = outcome.estimate.evidence.probability_wrong
+    if result.candidates is not None:
+        response.candidates = result.candidates
+    if answer is not None:
+        response.pose = answer.pose
+        response.protection_radius, response.protection_angle = answer.protection.radius, answer.protection.angle
+    return response

@@ -26,7 +26,10 @@ class UnservedError(Exception):
 
 @dataclass(frozen=True)
 class QueueLimits:
-    """How many requests may wait, and of how many bytes together; one may always."""
+    """How many requests may wait, for their turn or for the result that they share, and of how many bytes together.
+
+    One may always wait, of whatever size.
+    """
 
     requests: int = 8
     bytes: int = 32_000_000
@@ -51,10 +54,10 @@ NO_TERMS = Terms()
 
 
 class _Task(Generic[Item, Result]):
-    """A piece of work: `requested` by somebody, or offered; one that `yields` gives way to a request."""
+    """A piece of work: offered, or asked for by so many `requests`; one that `yields` gives way to a request."""
 
-    def __init__(self, item: Item, terms: Terms = NO_TERMS, requested: bool = False) -> None:
-        self.item, self.requested, self.yields = item, requested, False
+    def __init__(self, item: Item, terms: Terms = NO_TERMS) -> None:
+        self.item, self.requests, self.yields = item, 0, False
         self.future: Future[Result] = Future()
         self.interrupted = Event()
         self.set_terms(terms)
@@ -120,8 +123,10 @@ class Worker(Generic[Item, Result]):
 
     @property
     def waiting(self) -> int:
-        """Number of requests that wait."""
-        return len(self._requested)
+        """Number of requests that wait: for their turn, or for the result of what is done for another one."""
+        with self._changed:
+            sharing = max(0, self._running.requests - 1) if self._running else 0
+            return sum(task.requests for task in self._requested) + sharing
 
     @property
     def busy_seconds(self) -> float:
@@ -143,31 +148,24 @@ class Worker(Generic[Item, Result]):
 
         The Future raises UnservedError where it is not served, and is cancelled when the worker stops before that.
         """
-        task: _Task[Item, Result] = _Task(item, terms, requested=True)
+        new: _Task[Item, Result] = _Task(item, terms)
         with self._changed:
-            running = self._running
-            if running and not running.interrupted.is_set() and self._same(running.item, item):
-                if not running.requested:
-                    running.requested, running.yields = True, False
-                    running.set_terms(terms)
-                return running.future
-            for waiting in self._requested:
-                if self._same(waiting.item, item):
-                    return waiting.future
             if self._stopping:
-                task.future.cancel()
-                return task.future
-            full = self._full(terms.size)
+                new.future.cancel()
+                return new.future
+            task = self._same_task(item)
+            full = self._full(0 if task else terms.size)
             if full:
                 self.unserved += 1
-                task.drop(full)
-                return task.future
-            if self._offered and self._same(self._offered.item, item):
-                self._offered = None
-            self._requested.append(task)
-            if running and running.yields:
-                running.interrupted.set()
-            self._changed.notify()
+                new.drop(full)
+                return new.future
+            if task is None:
+                task = new
+                self._add(task)
+            elif not task.requests:
+                task.yields = False
+                task.set_terms(terms)
+            task.requests += 1
         return task.future
 
     def drop_late(self) -> None:
@@ -175,7 +173,7 @@ class Worker(Generic[Item, Result]):
         with self._changed:
             late = [task for task in self._requested if task.late]
             self._requested = deque(task for task in self._requested if not task.late)
-            self.unserved += len(late)
+            self.unserved += sum(task.requests for task in late)
         for task in late:
             task.drop_late()
 
@@ -192,12 +190,28 @@ class Worker(Generic[Item, Result]):
         self._thread.join(timeout)
         return not self._thread.is_alive()
 
+    def _same_task(self, item: Item) -> _Task[Item, Result] | None:
+        """Return the task whose result a request of `item` may share: what is worked on, or what is requested."""
+        running = self._running
+        if running and not running.interrupted.is_set() and self._same(running.item, item):
+            return running
+        return next((task for task in self._requested if self._same(task.item, item)), None)
+
     def _full(self, size: int) -> str:
         """Return why a request of so many bytes cannot wait; empty where it can."""
-        held = sum(task.terms.size for task in self._requested)
-        if len(self._requested) >= self.limits.requests or (self._requested and held + size > self.limits.bytes):
-            return f"{len(self._requested)} requests of {1e-6 * held:.0f} MB wait"
+        held, waiting = sum(task.terms.size for task in self._requested), self.waiting
+        if waiting >= self.limits.requests or (held and size and held + size > self.limits.bytes):
+            return f"{waiting} requests of {1e-6 * held:.0f} MB wait"
         return ""
+
+    def _add(self, task: _Task[Item, Result]) -> None:
+        """Let a requested task wait for its turn."""
+        if self._offered and self._same(self._offered.item, task.item):
+            self._offered = None
+        self._requested.append(task)
+        if self._running and self._running.yields:
+            self._running.interrupted.set()
+        self._changed.notify()
 
     # In a thread of its own.
 
@@ -215,7 +229,7 @@ class Worker(Generic[Item, Result]):
     def _next(self) -> _Task[Item, Result] | None:
         """Wait for what is to be done next, and return it; None when there is nothing more to come."""
         with self._changed:
-            if self._running and self._running.requested:
+            if self._running and self._running.requests:
                 now = time.monotonic()
                 self._offers_until = now + (now - self._started)
             self._running = None
@@ -237,7 +251,7 @@ class Worker(Generic[Item, Result]):
         try:
             result = self._work(task.item, task.is_to_stop)
         except Interrupted as error:
-            self._dropped += not task.requested
+            self._dropped += not task.requests
             self._fail(task, error if task.interrupted.is_set() else None)
         except Exception as error:
             self._fail(task, error)
@@ -246,7 +260,9 @@ class Worker(Generic[Item, Result]):
 
     def _fail(self, task: _Task[Item, Result], error: Exception | None) -> None:
         """End a task with an exception; without one it is late."""
-        self.unserved += error is None or isinstance(error, UnservedError)
+        if error is None or isinstance(error, UnservedError):
+            with self._changed:
+                self.unserved += task.requests
         if error is None:
             task.drop_late()
         else:

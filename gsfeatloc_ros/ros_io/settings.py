@@ -125,7 +125,12 @@ class ImageSettings:
 class RequestSettings:
     """How many requests are taken, and for how long each may wait."""
 
-    max_waiting: int = parameter(8, "Most requests that wait; one more is told `busy` at once.", (1, 10_000), live=True)
+    max_waiting: int = parameter(
+        8,
+        "Most requests that wait, for their turn or for an answer that they share; one more is told `busy` at once.",
+        (1, 10_000),
+        live=True,
+    )
     max_megabytes: float = parameter(
         32.0, "Most megabytes of images in the requests that wait, if more than one does.", (1.0, 100_000.0), live=True
     )

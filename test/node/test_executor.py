@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+from concurrent.futures import Future
 from contextlib import contextmanager
 
 import pytest
@@ -14,7 +16,7 @@ from rclpy.qos import HistoryPolicy, QoSProfile
 from std_srvs.srv import SetBool, Trigger
 
 from gsfeatloc_ros.node import executor as executor_module
-from gsfeatloc_ros.node.executor import GuardedExecutor, HopelessError
+from gsfeatloc_ros.node.executor import GuardedExecutor, HopelessError, Later
 from gsfeatloc_ros.node.parameters import refuse_unreadable
 
 
@@ -107,6 +109,47 @@ def test_of_requests_that_come_together_each_is_answered_once_and_timers_run_bet
         assert not failures
         # They did not all come first.
         assert len(set(served)) > 1
+
+
+def test_a_response_that_comes_later_costs_nothing_while_it_is_waited_for():
+    done, made = Future(), []
+
+    def serve(request, response):
+        def make():
+            made.append(threading.current_thread())
+            response.message = done.result()
+            return response
+
+        return Later(done, make)
+
+    with guarded_node() as (node, executor, failures):
+        node.create_service(Trigger, "serve", serve)
+        client = node.create_client(Trigger, "serve")
+        spin_until(executor, client.service_is_ready)
+        answers = [client.call_async(Trigger.Request()) for _ in range(8)]
+        ticks = []
+        node.create_timer(1e-3, lambda: ticks.append(1))
+        spin_until(executor, lambda: len(ticks) >= 20)
+        # Of many that wait none is looked at: what is done between two ticks is as much as without them.
+        assert not made
+        assert not [task for task, _, _ in executor._tasks if not task.done()]
+        threading.Thread(target=done.set_result, args=("later",)).start()
+        spin_until(executor, lambda: all(answer.done() for answer in answers))
+        assert [answer.result().message for answer in answers] == ["later"] * 8
+        assert set(made) == {threading.current_thread()}
+        assert not failures
+
+
+def test_a_response_that_cannot_be_made_later_is_a_failure():
+    done = Future()
+    done.set_exception(KeyError("unforeseen"))
+    with guarded_node() as (node, executor, failures):
+        node.create_service(Trigger, "serve", lambda request, response: Later(done, done.result))
+        client = node.create_client(Trigger, "serve")
+        spin_until(executor, client.service_is_ready)
+        client.call_async(Trigger.Request())
+        spin_until(executor, lambda: failures)
+        assert [type(failure) for failure in failures] == [KeyError]
 
 
 @pytest.mark.parametrize("asynchronous", [False, True])

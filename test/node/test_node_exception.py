@@ -12,6 +12,7 @@ from node_harness import assert_close, connected_client, node_arguments
 from rclpy.lifecycle import TransitionCallbackReturn
 
 from gsfeatloc_ros.client.messages import camera_info_of, pose_stamped, rgb_image
+from gsfeatloc_ros.node.executor import GuardedExecutor
 from gsfeatloc_ros.node.localizer_node import LocalizerNode
 
 
@@ -38,7 +39,7 @@ def node(room_map_file):
     engine = node.session.engine
     node.session.use_map(replace(engine, renderer=OutOfMemory(engine.renderer)), node.session.settings.map)
     node.trigger_activate()
-    spinning = threading.Thread(target=rclpy.spin, args=(node,))
+    spinning = threading.Thread(target=rclpy.spin, args=(node, GuardedExecutor(node.report_failure)))
     spinning.start()
     try:
         yield node

@@ -133,6 +133,39 @@ def test_no_more_requests_wait_than_the_limits_allow(gate, worker):
     assert gate.items == ["running", "a", "c", "d"]
 
 
+@pytest.mark.parametrize("turn", ["waits", "has come"])
+def test_who_shares_a_result_waits_as_well(gate, worker, turn):
+    worker.limits = QueueLimits(requests=3, bytes=100)
+    if turn == "waits":
+        worker.request("running")
+        gate.wait_until_started()
+    # Its bytes are held once.
+    shared = [worker.request("a", Terms(size=1000))]
+    if turn == "has come":
+        gate.wait_until_started()
+    while worker.waiting < 3:
+        shared.append(worker.request("a", Terms(size=1000)))
+    for item in "ab":
+        with pytest.raises(UnservedError, match="3 requests"):
+            worker.request(item).result(0)
+    assert worker.unserved == 2
+    for _ in range(2):
+        gate.go.release()
+    assert [future.result(TIMEOUT) for future in shared] == ["did a"] * (3 if turn == "waits" else 4)
+
+
+def test_all_who_share_a_result_are_told_when_its_time_is_up(gate, worker):
+    worker.request("running")
+    gate.wait_until_started()
+    shared = [worker.request("a", Terms(seconds=0.0)) for _ in range(3)]
+    time.sleep(0.01)
+    worker.drop_late()
+    for future in shared:
+        with pytest.raises(UnservedError, match=r"not served within 0 s"):
+            future.result(0)
+    assert (worker.waiting, worker.unserved) == (0, 3)
+
+
 def test_a_request_is_told_when_its_time_is_up(gate, worker):
     running = worker.request("running", Terms(seconds=0.1))
     gate.wait_until_started()
