@@ -28,8 +28,11 @@ def replaced_file(path: Path) -> Iterator[BinaryIO]:
         path: of the file; its folder must be there.
 
     Raises:
-        OSError: it cannot be written.
+        OSError: it cannot be written, or is a folder or a device.
     """
+    # Root could: others need it.
+    if path.is_char_device() or path.is_block_device():
+        raise OSError(f"{path} is a device")
     _remove_leftovers(path)
     # Beside it: a file is only renamed within a file system. Nobody can have put a link there under a name of chance.
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}{_SUFFIX}")

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import socket
+import sys
 import time
 from collections.abc import Mapping
+
+# Seconds that systemd may take to take what it is told, of which a few words wait in the socket; it asked for them.
+_TIMEOUT = 0.5
 
 
 class Systemd:
     """Tells systemd what it has asked to be told; does nothing where nobody asked.
+
+    Where systemd cannot be told, which will have it end the service, that is said once on the standard error.
 
     Args:
         environment: NOTIFY_SOCKET and WATCHDOG_USEC are read.
@@ -24,6 +29,7 @@ class Systemd:
         # Four beats in the time after which a silent service is killed.
         self._period = 1e-6 * int(microseconds) / 4 if microseconds.isdecimal() else None
         self._last_beat = 0.0
+        self._heard = True
 
     def ready(self) -> None:
         """Say that the start is over; from now on it watches whether the heart beats."""
@@ -41,6 +47,15 @@ class Systemd:
         self._tell("STOPPING=1")
 
     def _tell(self, state: str) -> None:
-        if self._address:
-            with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as stream:
+        if not self._address:
+            return
+        try:
+            with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as stream:
+                stream.settimeout(_TIMEOUT)
                 stream.sendto(state.encode(), self._address)
+            self._heard = True
+        except OSError as error:
+            if self._heard:
+                said = f"systemd cannot be told {state}: NOTIFY_SOCKET is {self._address!r}: {error}"
+                print(f"[WARN] [{time.time():.9f}] [localizer]: {said}", file=sys.stderr)
+            self._heard = False

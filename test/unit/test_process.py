@@ -65,11 +65,41 @@ def test_systemd_in_no_folder():
         assert server.recv(100) == b"READY=1"
 
 
-@pytest.mark.parametrize("environment", [{}, {"NOTIFY_SOCKET": "/nowhere", "WATCHDOG_USEC": "soon"}])
-def test_without_systemd_nothing_happens(environment):
-    systemd = Systemd(environment)
+def test_without_systemd_nothing_happens(capfd):
+    systemd = Systemd({})
     systemd.ready()
     systemd.beat()
+    assert capfd.readouterr() == ("", "")
+
+
+def test_where_systemd_cannot_be_told_that_is_said_once(capfd):
+    """Otherwise nobody knows why it ends a service that is ready."""
+    systemd = Systemd({"NOTIFY_SOCKET": "/nowhere", "WATCHDOG_USEC": "soon"})
+    systemd.ready()
+    systemd.beat()
+    systemd.stopping()
+    output, errors = capfd.readouterr()
+    assert output == ""
+    (line,) = errors.splitlines()
+    assert "systemd cannot be told READY=1: NOTIFY_SOCKET is '/nowhere': " in line
+
+
+def test_a_systemd_that_does_not_listen_does_not_hold_up_the_node(tmp_path, capfd):
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as server:
+        server.bind(str(tmp_path / "notify"))
+        systemd = Systemd({"NOTIFY_SOCKET": str(tmp_path / "notify"), "WATCHDOG_USEC": "4"})
+        filled = threading.Event()
+
+        def beat() -> None:
+            # More than the kernel keeps for who does not take them.
+            while not capfd.readouterr().err:
+                systemd.beat()
+            filled.set()
+
+        threading.Thread(target=beat, daemon=True).start()
+        assert filled.wait(TIMEOUT)
+        server.recv(100)
+        systemd.beat()
 
 
 def test_what_is_loaded_is_returned_and_what_is_raised_is_raised():

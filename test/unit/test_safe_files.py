@@ -81,6 +81,18 @@ def test_a_link_at_the_file_is_replaced_and_not_followed(path):
     assert not link.is_symlink()
 
 
+@pytest.mark.parametrize("make", [Path.mkdir, lambda path: path.symlink_to("/dev/full")], ids=["folder", "device"])
+def test_a_folder_or_a_device_is_not_replaced(path, make):
+    """Root could put a file in the place of /dev/full."""
+    other = path.with_name("other")
+    make(other)
+    before = other.lstat()
+    with pytest.raises(OSError, match=r"is a device|Is a directory"):
+        write(other)
+    assert other.lstat().st_ino == before.st_ino
+    assert {file.name for file in path.parent.iterdir()} == {"file", "other"}
+
+
 def test_no_name_can_be_planted(path):
     """A file in progress has a name that cannot be known, and is made anew, never opened."""
     names = set()
