@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import stat
 import subprocess
@@ -157,6 +158,48 @@ def test_kernels_that_others_can_have_compiled_are_not_loaded(tmp_path, monkeypa
         assert root not in kernel_cache_folder().parents
         assert can_write(kernel_cache_folder())
     assert caplog.text.count("for this run only") == 1
+
+
+TWICE = """
+import resource, sys
+from gsfeatloc_ros.common.kernels import njit
+
+@njit(cache=True)
+def twice(number):
+    return 2 * number
+
+@njit
+def thrice(number):
+    return 3 * number
+
+if __name__ == "__main__":
+    # A file can be made but not written, as on a full disk.
+    if sys.argv[1] == "full":
+        resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
+    print(twice(21), twice(1.5), thrice(1))
+"""
+
+
+def test_a_call_that_compiles_does_not_fail_for_its_cache(tmp_path):
+    root = tmp_path / "root"
+    root.mkdir()
+    (root / "twice.py").write_text(TWICE)
+    folder, package = tmp_path / "kernels", Path(gsfeatloc_ros.__file__).parents[1]
+    environment = {**os.environ, "PYTHONPATH": str(package), "NUMBA_CACHE_DIR": str(folder)}
+
+    def warnings(disk: str) -> str:
+        command = [sys.executable, "twice.py", disk]
+        finished = subprocess.run(command, cwd=root, env=environment, capture_output=True, text=True, timeout=300)
+        assert finished.stdout == "42 3.0 3\n", finished.stderr
+        return finished.stderr
+
+    said = rf"compiled kernels are for this run only, {folder}/\S+ cannot be used: .*\n"
+    assert re.fullmatch(said, warnings("full"))
+    assert not warnings("empty")
+    (index,) = folder.rglob("twice.twice*.nbi")
+    index.unlink()
+    index.mkdir()
+    assert re.fullmatch(said, warnings("empty"))
 
 
 def test_relative_cache_home_is_ignored(monkeypatch):
