@@ -21,11 +21,12 @@ find_python() {
     local candidate
     # The one that is called python3 first: with a sourced ROS it is the one that has rclpy.
     for candidate in ${PYTHON:-python3 python3.12 python3.11}; do
-        # The interpreter behind it: .venv itself, if that is active, is about to be replaced.
+        # The interpreter behind it: .venv itself, if that is active, is about to be replaced. By its file's own name: an
+        # active .venv says that one, and would be made anew for a python3 that is a link to it.
         if "$candidate" -c '
-import sys
+import os, sys
 if sys.version_info[:2] not in ((3, 11), (3, 12)): sys.exit(1)
-print(sys._base_executable)' 2>/dev/null; then
+print(os.path.realpath(sys._base_executable))' 2>/dev/null; then
             return
         fi
     done
