@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from gsfeatloc_ros.common.camera import Camera
+    from gsfeatloc_ros.evaluate.photo_file import read_photo
     from gsfeatloc_ros.localize.estimate import Estimate, Status
     from gsfeatloc_ros.localize.localizer import Localizer
     from gsfeatloc_ros.localize.options import LocalizerOptions
@@ -23,6 +24,7 @@ __all__ = [
     "create_matcher",
     "create_renderer",
     "load_map",
+    "read_photo",
 ]
 
 # Where each name is. They are imported when first used: numba, torch and OpenCV take seconds.
@@ -35,6 +37,7 @@ _MODULES = {
     "create_matcher": "match",
     "create_renderer": "render",
     "load_map": "maps",
+    "read_photo": "evaluate.photo_file",
 }
 
 
