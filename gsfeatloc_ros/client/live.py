@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import threading
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from gsfeatloc_ros.client.messages import pose_with_covariance, read_diagnostics
 from gsfeatloc_ros.node.qos import LATCHED, RELIABLE
 from gsfeatloc_ros.ros_io.decode import decode_covariance, decode_pose, nanoseconds
 from gsfeatloc_ros.ros_io.raw_image import decode_image
-from gsfeatloc_ros.view.attempts import Attempt
+from gsfeatloc_ros.view.attempts import Attempt, Prior
 from gsfeatloc_ros.view.jpeg import encoded
 from gsfeatloc_ros.view.store import Store
 
@@ -49,6 +50,7 @@ class LiveNode(ClientNode):
         self._listen(Image, "debug_image", self._on_debug_image)
         self._listen(PoseStamped, "prior", self._on_prior)
         self._listen(PoseWithCovarianceStamped, "prior_with_covariance", self._on_prior)
+        self._listen(PoseWithCovarianceStamped, "initialpose", partial(self._on_prior, of_base=True))
         self._stopped = threading.Event()
         self._thread = threading.Thread(target=self._run, name="live", daemon=True)
         self._thread.start()
@@ -82,9 +84,8 @@ class LiveNode(ClientNode):
         message.header.stamp = self.node.get_clock().now().to_msg()
         publisher.publish(message)
         listeners = publisher.get_subscription_count()
-        # This node listens to one of the two itself.
-        others = listeners - (topic == "prior_with_covariance")
-        return f"sent on {publisher.topic_name}" + ("" if others > 0 else ", but nobody listens there")
+        # One of them is this node itself, which has it drawn.
+        return f"sent on {publisher.topic_name}" + ("" if listeners > 1 else ", but nobody listens there")
 
     # In the thread.
 
@@ -115,9 +116,9 @@ class LiveNode(ClientNode):
     def _on_debug_image(self, message: Image) -> None:
         self._store.add_picture(nanoseconds(message.header.stamp), encoded(decode_image(message)))
 
-    def _on_prior(self, message: PoseStamped | PoseWithCovarianceStamped) -> None:
+    def _on_prior(self, message: PoseStamped | PoseWithCovarianceStamped, of_base: bool = False) -> None:
         if message.header.frame_id == self._frame:
-            self._store.add_prior(decode_pose(message, "prior"))
+            self._store.add_prior(Prior(decode_pose(message, "prior"), of_base))
 
 
 def _poses(message: PoseArray) -> np.ndarray:

@@ -85,8 +85,10 @@ class AnswersPanel:
             return
         number, attempt = shown[row]
         prior = self._store.prior(attempt.stamp)
-        pose = prior if attempt.pose is None else attempt.pose
-        self._details.content = self._words(number, attempt, prior is not None)
+        # A base says nothing of where its camera is.
+        seen_from = prior.pose if prior is not None and not prior.of_base else None
+        pose = seen_from if attempt.pose is None else attempt.pose
+        self._details.content = self._words(number, attempt, seen_from is not None)
         self._drawing.chosen(attempt.pose)
         self._drawing.prior(prior)
         self._drawing.searched(attempt.searched)
@@ -102,11 +104,11 @@ class AnswersPanel:
         origin = "prior" if attempt.pose is None else "answer"
         self._show(self._map, drawn, f"The map from the {origin}")
 
-    def _words(self, number: int, attempt: Attempt, has_prior: bool) -> str:
+    def _words(self, number: int, attempt: Attempt, at_prior: bool) -> str:
         lines = [f"**{number}: {plain(attempt.status)}**", plain(attempt.reason)]
         if attempt.pose is not None:
             lines.append(plain("at " + " ".join(f"{value:.3f}" for value in attempt.pose[:3, 3])))
-        elif has_prior:
+        elif at_prior:
             lines.append("There is no answer: you stand at its prior.")
         if attempt.covariance is not None:
             sigmas = np.sqrt(np.maximum(np.linalg.eigvalsh(attempt.covariance[:3, :3]), 0.0))

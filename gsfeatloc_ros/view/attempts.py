@@ -43,6 +43,19 @@ class Attempt:
         return f"{self.stamp / 1e9:.2f}"
 
 
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """Where the node was told to look first.
+
+    Attributes:
+        pose: (4, 4) T_map_camera, or T_map_base.
+        of_base: the second.
+    """
+
+    pose: np.ndarray
+    of_base: bool = False
+
+
 def read_replay(folder: Path) -> list[Attempt]:
     """Read what replay wrote into a folder: answers.csv, and the covariances of the bag `answers` if it is there.
 

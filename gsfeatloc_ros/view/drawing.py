@@ -11,8 +11,8 @@ from viser import ViserServer
 
 from gsfeatloc_ros.common.geometry import quaternion_from_matrix
 from gsfeatloc_ros.maps.similarity import Similarity
-from gsfeatloc_ros.view.attempts import Attempt
-from gsfeatloc_ros.view.shapes import EDGES, ellipsoids, frustums
+from gsfeatloc_ros.view.attempts import Attempt, Prior
+from gsfeatloc_ros.view.shapes import EDGES, base_outline, ellipsoids, frustums
 from gsfeatloc_ros.view.splats import Splats
 
 # RGB by how an attempt ended; others are grey.
@@ -143,9 +143,13 @@ class Drawing:
         sigma = float(np.median(sigmas)) if sigmas else 0.0
         return max(1.0, round_down(_VISIBLE * self._radius / sigma)) if sigma > 0 else 1.0
 
-    def prior(self, pose: np.ndarray | None) -> None:
-        """Draw the prior (4, 4)."""
-        self._cameras("/prior", [] if pose is None else [pose], 1.5 * _CAMERA, np.array(_PRIOR))
+    def prior(self, prior: Prior | None) -> None:
+        """Draw a prior: a camera, or the outline of a base with an arrow ahead."""
+        size, colour = 1.5 * _CAMERA, np.array(_PRIOR)
+        if prior is not None and prior.of_base:
+            self._lines("/prior", base_outline(prior.pose, size * self._radius), colour)
+        else:
+            self._cameras("/prior", [] if prior is None else [prior.pose], size, colour)
 
     def chosen(self, pose: np.ndarray | None) -> None:
         """Draw what was chosen among the answers, larger."""
@@ -182,10 +186,15 @@ class Drawing:
             self._remove(name)
             return
         each = np.broadcast_to(colours, (len(poses), 3)).repeat(EDGES, axis=0)
+        self._lines(name, frustums(poses, size * self._radius), each)
+
+    def _lines(self, name: str, lines: np.ndarray, colours: np.ndarray) -> None:
+        """Draw lines (N, 2, 3) in one colour (3,), or one each (N, 3)."""
+        each = np.broadcast_to(colours, (len(lines), 3))
         self._put(
             name,
             self._scene.add_line_segments,
-            points=frustums(poses, size * self._radius).astype(np.float32),
+            points=lines.astype(np.float32),
             colors=linear(np.repeat(each[:, None], 2, axis=1)),
             thickness=2.0,
             thickness_units="screen",

@@ -89,7 +89,7 @@ class Page:
         self._prior: PriorPanel | None = None
         if sender is not None:
             with tabs.add_tab("Prior"):
-                self._prior = PriorPanel(self._server, clicks, self._drawing, sender)
+                self._prior = PriorPanel(self._server, clicks, sender)
 
     def update(self) -> None:
         """Show what came since the last time."""

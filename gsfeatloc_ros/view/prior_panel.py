@@ -9,7 +9,6 @@ from viser import GuiEvent, ViserServer
 
 from gsfeatloc_ros.common.geometry import isotropic_covariance, make_pose, matrix_from_quaternion, so3_exp
 from gsfeatloc_ros.view.clicks import Clicks
-from gsfeatloc_ros.view.drawing import Drawing
 from gsfeatloc_ros.view.words import plain
 
 
@@ -29,12 +28,11 @@ class PriorPanel:
     Args:
         server: of the page.
         clicks: asks for points.
-        drawing: shows the prior.
         sender: sends it.
     """
 
-    def __init__(self, server: ViserServer, clicks: Clicks, drawing: Drawing, sender: PriorSender) -> None:
-        self._clicks, self._drawing, self._sender = clicks, drawing, sender
+    def __init__(self, server: ViserServer, clicks: Clicks, sender: PriorSender) -> None:
+        self._clicks, self._sender = clicks, sender
         gui = server.gui
         gui.add_markdown("A prior says to the node where to look first.")
         self._metres = gui.add_number("Known to, map units", 0.5, min=1e-3)
@@ -62,7 +60,6 @@ class PriorPanel:
             return
         w, x, y, z = event.client.camera.wxyz
         pose = make_pose(matrix_from_quaternion([x, y, z, w]), event.client.camera.position)
-        self._drawing.prior(pose)
         self.say(self._sender.send_camera(pose, self._covariance()))
 
     def _covariance(self) -> np.ndarray:

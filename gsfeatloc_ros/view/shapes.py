@@ -21,11 +21,27 @@ _EDGES = np.array(
 # Lines of a camera.
 EDGES = len(_EDGES)
 
+# A base's outline, half a unit to each side, and an arrow from its middle to one unit ahead (x ahead, y left, z up).
+_OUTLINE = np.array([[-0.5, -0.5, 0.0], [0.5, -0.5, 0.0], [0.5, 0.5, 0.0], [-0.5, 0.5, 0.0]])
+_TIP, _BARBS = np.array([1.0, 0.0, 0.0]), np.array([[0.7, 0.2, 0.0], [0.7, -0.2, 0.0]])
+_BASE = np.array(
+    [
+        *zip(_OUTLINE, np.roll(_OUTLINE, -1, axis=0), strict=True),
+        (np.zeros(3), _TIP),
+        *[(_TIP, barb) for barb in _BARBS],
+    ]
+)
+
 
 def frustums(poses: Sequence[np.ndarray], size: float) -> np.ndarray:
     """Return cameras at poses (4, 4), T_map_camera, as lines (N * EDGES, 2, 3), `size` from the centre to the image."""
     ends = size * _EDGES.reshape(-1, 3)
     return np.array([transform(pose, ends) for pose in poses]).reshape(-1, 2, 3)
+
+
+def base_outline(pose: np.ndarray, size: float) -> np.ndarray:
+    """Return a base at a pose (4, 4), T_map_base, as lines (L, 2, 3): a square `size` wide, and an arrow ahead."""
+    return transform(pose, size * _BASE.reshape(-1, 3)).reshape(-1, 2, 3)
 
 
 def ellipsoids(covariances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from gsfeatloc_ros.view.attempts import Attempt
+from gsfeatloc_ros.view.attempts import Attempt, Prior
 from gsfeatloc_ros.view.recorded import SmallPhoto
 
 # Attempts that are kept: an hour, of one each four seconds.
@@ -22,8 +22,8 @@ class Store:
         self._lock = threading.Lock()
         self._attempts: dict[int, Attempt] = {}
         self._pictures: dict[int, SmallPhoto | np.ndarray] = {}
-        self._priors: dict[int, np.ndarray] = {}
-        self._newest_prior: np.ndarray | None = None
+        self._priors: dict[int, Prior] = {}
+        self._newest_prior: Prior | None = None
         self._changes = 0
 
     def add(self, attempt: Attempt) -> None:
@@ -39,17 +39,17 @@ class Store:
                     group.pop(oldest, None)
             self._changes += 1
 
-    def add_prior(self, pose: np.ndarray) -> None:
-        """Take a prior (4, 4): it is that of the attempts which come after it."""
+    def add_prior(self, prior: Prior) -> None:
+        """Take a prior: it is that of the attempts which come after it."""
         with self._lock:
-            self._newest_prior = pose
+            self._newest_prior = prior
             self._changes += 1
 
     def add_recording(self, photos: Mapping[int, SmallPhoto], priors: Mapping[int, np.ndarray]) -> None:
-        """Take photos, and priors (4, 4), by stamp."""
+        """Take photos, and priors (4, 4) of the camera, by stamp."""
         with self._lock:
             self._pictures.update(photos)
-            self._priors.update(priors)
+            self._priors.update({stamp: Prior(pose) for stamp, pose in priors.items()})
             self._changes += 1
 
     def add_picture(self, stamp: int, jpeg: np.ndarray) -> None:
@@ -66,7 +66,7 @@ class Store:
         return self._changes
 
     @property
-    def newest_prior(self) -> np.ndarray | None:
+    def newest_prior(self) -> Prior | None:
         """What came last of `add_prior`."""
         return self._newest_prior
 
@@ -80,8 +80,8 @@ class Store:
         with self._lock:
             return self._pictures.get(stamp)
 
-    def prior(self, stamp: int) -> np.ndarray | None:
-        """Return the prior (4, 4) that an attempt began with."""
+    def prior(self, stamp: int) -> Prior | None:
+        """Return the prior that an attempt began with."""
         with self._lock:
             return self._priors.get(stamp)
 

@@ -85,14 +85,19 @@ def test_an_attempt_is_put_together_of_all_that_a_node_says_of_it(live, robot):
     np.testing.assert_allclose(attempt.covariance, np.eye(6))
     assert attempt.candidates.shape == (2, 4, 4)
     assert attempt.searched.shape == (3, 4, 4)
-    np.testing.assert_allclose(store.prior(STAMP), POSE)
+    np.testing.assert_allclose(store.prior(STAMP).pose, POSE)
+    assert not store.prior(STAMP).of_base
 
 
 def test_priors_are_sent_as_rviz_does_and_of_the_camera(live, robot):
     from geometry_msgs.msg import PoseWithCovarianceStamped
 
-    node, _ = live
+    node, store = live
     assert "nobody listens" in node.send_base(POSE, np.eye(6))
+    # What is sent is shown as what comes from others is.
+    wait_for(lambda: store.newest_prior is not None)
+    assert store.newest_prior.of_base
+    np.testing.assert_allclose(store.newest_prior.pose, POSE)
     got = []
     for topic in ("initialpose", "prior_with_covariance"):
         robot.node.create_subscription(PoseWithCovarianceStamped, f"/robot/{topic}", got.append, 10)
@@ -103,6 +108,7 @@ def test_priors_are_sent_as_rviz_does_and_of_the_camera(live, robot):
     assert got[0].header.frame_id == "map"
     assert got[0].pose.pose.position.y == 2.0
     assert got[0].pose.covariance[0] == 1.0
+    wait_for(lambda: not store.newest_prior.of_base)
 
 
 def test_a_running_localizer_takes_the_prior_of_two_clicks_and_is_seen(tf, room_map_file, room_camera, photo):

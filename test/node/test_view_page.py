@@ -6,6 +6,7 @@ import re
 import signal
 import subprocess
 import sys
+from contextlib import contextmanager
 from functools import partial
 
 import browser as chromium
@@ -14,7 +15,6 @@ import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
-from gsfeatloc_ros.maps.ply import write_ply
 from gsfeatloc_ros.ros_io.parameter_file import read_parameter_file
 
 NAMES = "stamp,status,reason,x,y,z,qx,qy,qz,qw,var_x,var_y,var_z,var_rx,var_ry,var_rz"
@@ -22,23 +22,20 @@ NAMES = "stamp,status,reason,x,y,z,qx,qy,qz,qw,var_x,var_y,var_z,var_rx,var_ry,v
 ANSWER = "1.5,localized,well done,0,0,1.5,-0.5,0.5,-0.5,0.5,1e-4,1e-4,1e-4,1e-6,1e-6,1e-6"
 FAILURE = "2.5,failed,<b>dark</b>,,,,,,,,,,,,,"
 
+needs_chromium = pytest.mark.skipif(not chromium.EXECUTABLE, reason=f"there is no {' or '.join(chromium.NAMES)}")
 
-@pytest.fixture(scope="module")
-def page(room_map, tmp_path_factory):
-    """The address of the page, and the parameter file that it may write."""
-    folder = tmp_path_factory.mktemp("view")
-    write_ply(folder / "room.ply", room_map)
-    (folder / "replayed").mkdir()
-    (folder / "replayed" / "answers.csv").write_text("\n".join([NAMES, ANSWER, FAILURE]))
-    command = [sys.executable, "-P", "-m", "gsfeatloc_ros.tools.view", folder / "room.ply", "--port", "0"]
-    command += ["--answers", folder / "replayed", "--out", folder / "map.yaml", "--gaussians", "2000"]
+
+@contextmanager
+def served(map_file, *options):
+    """Serve the page of a map; yield its address."""
+    command = [sys.executable, "-P", "-m", "gsfeatloc_ros.tools.view", map_file, "--port", "0", "--gaussians", "2000"]
     # Who runs tests in the background has them ignore Ctrl-C, and their children inherit that.
     heed = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, preexec_fn=heed)
+    process = subprocess.Popen([*command, *options], stdout=subprocess.PIPE, text=True, preexec_fn=heed)
     try:
         address = process.stdout.readline().strip()
         assert re.fullmatch(r"http://127\.0\.0\.1:\d+", address)
-        yield address, folder / "map.yaml"
+        yield address
         process.send_signal(signal.SIGINT)
         assert process.wait(30) == 130
     finally:
@@ -46,7 +43,17 @@ def page(room_map, tmp_path_factory):
         process.wait()
 
 
-@pytest.mark.skipif(not chromium.EXECUTABLE, reason=f"there is no {' or '.join(chromium.NAMES)}")
+@pytest.fixture(scope="module")
+def page(room_map_file, tmp_path_factory):
+    """The address of the page, and the parameter file that it may write."""
+    folder = tmp_path_factory.mktemp("view")
+    (folder / "replayed").mkdir()
+    (folder / "replayed" / "answers.csv").write_text("\n".join([NAMES, ANSWER, FAILURE]))
+    with served(room_map_file, "--answers", folder / "replayed", "--out", folder / "map.yaml") as address:
+        yield address, folder / "map.yaml"
+
+
+@needs_chromium
 def test_a_user_sees_the_map_stands_at_an_answer_and_sets_the_floor(page, tmp_path):
     address, parameters = page
     with chromium.browser(address, tmp_path / "profile") as user:
@@ -80,6 +87,27 @@ def test_a_user_sees_the_map_stands_at_an_answer_and_sets_the_floor(page, tmp_pa
         user.wait_for_text("units are 1 m: scale")
     values = read_parameter_file(parameters)
     np.testing.assert_allclose(values["map.translation"], [0, 0, 0], atol=0.05)
+
+
+@needs_chromium
+def test_a_prior_of_the_base_that_is_clicked_is_drawn(room_map_file, tmp_path):
+    with served(room_map_file, "--live") as address, chromium.browser(address, tmp_path / "profile") as user:
+        user.wait_for_text("room.ply")
+
+        def yellow():
+            """Return how many pixels left of the panel are of the prior's colour."""
+            return (np.abs(user.screenshot()[100:, :350].astype(int) - (250, 200, 20)).max(axis=2) < 40).sum()
+
+        chromium.wait_for(lambda: user.screenshot()[100:, :250].std() > 15, "the map")
+        before = yellow()
+        user.press("Prior")
+        user.press("Base: click where it is")
+        user.wait_for_text("0 of 2 clicked")
+        user.click(150, 380)
+        user.wait_for_text("1 of 2 clicked")
+        user.click(250, 330)
+        user.wait_for_text("sent on /initialpose, but nobody listens there")
+        chromium.wait_for(lambda: yellow() > before + 50, "the base")
 
 
 def test_a_page_from_elsewhere_is_not_served(page):

@@ -24,14 +24,14 @@ from gsfeatloc_ros.replay.bag import Role
 from gsfeatloc_ros.ros_io.parameter_file import read_parameter_file
 from gsfeatloc_ros.simulate import simulate_photos
 from gsfeatloc_ros.simulate.bag import CAMERA_INFO_TOPIC, IMAGE_TOPIC, PRIOR_TOPIC, write_bag
-from gsfeatloc_ros.view.attempts import Attempt, read_replay
+from gsfeatloc_ros.view.attempts import Attempt, Prior, read_replay
 from gsfeatloc_ros.view.drawing import counts, round_down
 from gsfeatloc_ros.view.picking import point_on_map
 from gsfeatloc_ros.view.placing import Placing
 from gsfeatloc_ros.view.prior_panel import base_facing
 from gsfeatloc_ros.view.recorded import WIDTH, read_recording, small_photo
 from gsfeatloc_ros.view.server import is_own_page
-from gsfeatloc_ros.view.shapes import EDGES, ellipsoids, frustums, looking_along
+from gsfeatloc_ros.view.shapes import EDGES, base_outline, ellipsoids, frustums, looking_along
 from gsfeatloc_ros.view.splats import thinned_splats
 from gsfeatloc_ros.view.store import Store
 from gsfeatloc_ros.view.words import plain
@@ -84,6 +84,16 @@ def test_cameras_show_their_image():
     size = np.ptp(inside[:4, 1], axis=0)
     np.testing.assert_allclose(inside[:4, 1, 2], 0.5)
     assert size[0] / size[1] == pytest.approx(4 / 3)
+
+
+def test_a_base_lies_where_it_stands_and_points_ahead():
+    pose = base_facing(np.array([1.0, 2.0, 0.1]), np.array([1.0, 5.0, 0.9]))
+    lines = base_outline(pose, 0.5)
+    np.testing.assert_allclose(lines[..., 2], 0.1)
+    corners, arrow = lines[:4, 0], lines[4]
+    np.testing.assert_allclose(corners.mean(axis=0), [1, 2, 0.1])
+    np.testing.assert_allclose(np.ptp(corners, axis=0), [0.5, 0.5, 0], atol=1e-12)
+    np.testing.assert_allclose(arrow, [[1, 2, 0.1], [1, 2.5, 0.1]])
 
 
 @given(arrays(np.float64, (3, 3), elements=st.floats(-2, 2)))
@@ -233,7 +243,8 @@ def test_no_other_page_may_use_this_one(headers, only_here, own):
 def test_what_is_said_of_an_attempt_comes_together():
     store, pose = Store(), make_pose(np.eye(3), [1.0, 2.0, 3.0])
     assert store.attempts() == []
-    store.add_prior(pose)
+    prior = Prior(pose)
+    store.add_prior(prior)
     store.add(Attempt(7, "", "", pose, np.eye(6)))
     store.add(Attempt(7, "localized", "so it is"))
     store.add(Attempt(7, "", "", candidates=np.array([pose, pose])))
@@ -243,7 +254,7 @@ def test_what_is_said_of_an_attempt_comes_together():
     assert first.pose is pose
     assert len(first.candidates) == 2
     assert second.pose is None
-    assert store.prior(7) is pose
+    assert store.prior(7) is prior
     assert counts(store.attempts()) == {"failed": 1, "localized": 1}
     before = store.changes
     for stamp in range(2000):
