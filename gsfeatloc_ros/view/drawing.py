@@ -12,7 +12,7 @@ from viser import ViserServer
 from gsfeatloc_ros.common.geometry import quaternion_from_matrix
 from gsfeatloc_ros.maps.similarity import Similarity
 from gsfeatloc_ros.view.attempts import Attempt, Prior
-from gsfeatloc_ros.view.shapes import EDGES, base_outline, ellipsoids, frustums
+from gsfeatloc_ros.view.shapes import EDGES, base_box, ellipsoids, frustums
 from gsfeatloc_ros.view.splats import Splats
 
 # RGB by how an attempt ended; others are grey.
@@ -27,7 +27,7 @@ GREY = (120, 120, 120)
 _PRIOR, _CHOSEN, _INDEX, _MARK = (250, 200, 20), (0, 190, 230), (110, 130, 170), (240, 30, 140)
 _SEARCHED = (200, 120, 60)
 # Of a camera, as a share of the map's radius; of views of the map less: there are many.
-_CAMERA, _VIEW, _AXES, _MARK_SIZE = 0.04, 0.015, 0.08, 0.006
+_CAMERA, _VIEW, _BASE, _AXES, _MARK_SIZE = 0.04, 0.015, 0.08, 0.08, 0.006
 # Ellipsoids of this share of the radius can be seen.
 _VISIBLE = 0.02
 # Cells of the floor over the map, about, and the most.
@@ -144,12 +144,11 @@ class Drawing:
         return max(1.0, round_down(_VISIBLE * self._radius / sigma)) if sigma > 0 else 1.0
 
     def prior(self, prior: Prior | None) -> None:
-        """Draw a prior: a camera, or the outline of a base with an arrow ahead."""
-        size, colour = 1.5 * _CAMERA, np.array(_PRIOR)
+        """Draw a prior: a camera, or a base with an arrow ahead."""
         if prior is not None and prior.of_base:
-            self._lines("/prior", base_outline(prior.pose, size * self._radius), colour)
+            self._lines("/prior", base_box(prior.pose, _BASE * self._radius), np.array(_PRIOR))
         else:
-            self._cameras("/prior", [] if prior is None else [prior.pose], size, colour)
+            self._cameras("/prior", [] if prior is None else [prior.pose], 1.5 * _CAMERA, np.array(_PRIOR))
 
     def chosen(self, pose: np.ndarray | None) -> None:
         """Draw what was chosen among the answers, larger."""

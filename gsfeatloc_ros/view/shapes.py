@@ -21,14 +21,18 @@ _EDGES = np.array(
 # Lines of a camera.
 EDGES = len(_EDGES)
 
-# A base's outline, half a unit to each side, and an arrow from its middle to one unit ahead (x ahead, y left, z up).
-_OUTLINE = np.array([[-0.5, -0.5, 0.0], [0.5, -0.5, 0.0], [0.5, 0.5, 0.0], [-0.5, 0.5, 0.0]])
-_TIP, _BARBS = np.array([1.0, 0.0, 0.0]), np.array([[0.7, 0.2, 0.0], [0.7, -0.2, 0.0]])
+# A base: a box, half a unit to each side of where it stands and as high, and on top of it an arrow to one unit ahead
+# (x ahead, y left, z up).
+_GROUND = np.array([[-0.5, -0.5, 0.0], [0.5, -0.5, 0.0], [0.5, 0.5, 0.0], [-0.5, 0.5, 0.0]])
+_ROOF = _GROUND + np.array([0.0, 0.0, 0.5])
+_TIP = np.array([1.0, 0.0, 0.5])
+_ARROW = np.array([[0.0, 0.0, 0.5], [0.7, 0.2, 0.5], [0.7, -0.2, 0.5]])
 _BASE = np.array(
     [
-        *zip(_OUTLINE, np.roll(_OUTLINE, -1, axis=0), strict=True),
-        (np.zeros(3), _TIP),
-        *[(_TIP, barb) for barb in _BARBS],
+        *zip(_GROUND, np.roll(_GROUND, -1, axis=0), strict=True),
+        *zip(_ROOF, np.roll(_ROOF, -1, axis=0), strict=True),
+        *zip(_GROUND, _ROOF, strict=True),
+        *[(_TIP, end) for end in _ARROW],
     ]
 )
 
@@ -39,8 +43,8 @@ def frustums(poses: Sequence[np.ndarray], size: float) -> np.ndarray:
     return np.array([transform(pose, ends) for pose in poses]).reshape(-1, 2, 3)
 
 
-def base_outline(pose: np.ndarray, size: float) -> np.ndarray:
-    """Return a base at a pose (4, 4), T_map_base, as lines (L, 2, 3): a square `size` wide, and an arrow ahead."""
+def base_box(pose: np.ndarray, size: float) -> np.ndarray:
+    """Return a base at a pose (4, 4), T_map_base, as lines (L, 2, 3): a box `size` wide with an arrow ahead."""
     return transform(pose, size * _BASE.reshape(-1, 3)).reshape(-1, 2, 3)
 
 

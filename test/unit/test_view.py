@@ -31,7 +31,7 @@ from gsfeatloc_ros.view.placing import Placing
 from gsfeatloc_ros.view.prior_panel import base_facing
 from gsfeatloc_ros.view.recorded import WIDTH, read_recording, small_photo
 from gsfeatloc_ros.view.server import is_own_page
-from gsfeatloc_ros.view.shapes import EDGES, base_outline, ellipsoids, frustums, looking_along
+from gsfeatloc_ros.view.shapes import EDGES, base_box, ellipsoids, frustums, looking_along
 from gsfeatloc_ros.view.splats import thinned_splats
 from gsfeatloc_ros.view.store import Store
 from gsfeatloc_ros.view.words import plain
@@ -88,12 +88,11 @@ def test_cameras_show_their_image():
 
 def test_a_base_lies_where_it_stands_and_points_ahead():
     pose = base_facing(np.array([1.0, 2.0, 0.1]), np.array([1.0, 5.0, 0.9]))
-    lines = base_outline(pose, 0.5)
-    np.testing.assert_allclose(lines[..., 2], 0.1)
-    corners, arrow = lines[:4, 0], lines[4]
-    np.testing.assert_allclose(corners.mean(axis=0), [1, 2, 0.1])
-    np.testing.assert_allclose(np.ptp(corners, axis=0), [0.5, 0.5, 0], atol=1e-12)
-    np.testing.assert_allclose(arrow, [[1, 2, 0.1], [1, 2.5, 0.1]])
+    lines = base_box(pose, 0.5)
+    ground, ahead = lines[:4, 0], lines[np.argmax(lines[:, 0, 1])]
+    np.testing.assert_allclose(ground.mean(axis=0), [1, 2, 0.1])
+    np.testing.assert_allclose(np.ptp(ground, axis=0), [0.5, 0.5, 0], atol=1e-12)
+    np.testing.assert_allclose(ahead, [[1, 2.5, 0.35], [1, 2, 0.35]])
 
 
 @given(arrays(np.float64, (3, 3), elements=st.floats(-2, 2)))
