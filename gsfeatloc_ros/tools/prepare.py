@@ -110,7 +110,9 @@ def _plan(options: argparse.Namespace, given: MapSettings) -> tuple[Bundle, dict
         sources[ALIGNMENT] = options.align
     made_by = {"gsfeatloc_ros": _version(), "map": Path(given.path).name, "matcher": options.matcher}
     contents = {name: content_of(file) for name, file in sources.items()}
-    bundle = Bundle(options.out, map_name, contents, parameters=given.bundled(), made_by=made_by)
+    # As the index has it, which goes there too.
+    folder = Path(os.path.abspath(options.out))
+    bundle = Bundle(folder, map_name, contents, parameters=given.bundled(), made_by=made_by)
     _check_place(bundle)
     bundle.write()
     return bundle, sources

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from contextlib import chdir
 from pathlib import Path
 
 import numpy as np
@@ -27,8 +28,9 @@ def made(tmp_path_factory, room_map_file) -> Path:
     """A bundle, to be copied and not to be changed."""
     folder = tmp_path_factory.mktemp("made")
     write_parameters(folder / "align.yaml", PLACED, ["scale: 2.000 +- 0.001"])
-    arguments = [str(room_map_file), "--align", str(folder / "align.yaml"), "--out", str(folder / "room"), *FEW]
-    assert prepare.main(arguments) == 0
+    # As it is typed, with paths from here.
+    with chdir(folder):
+        assert prepare.main([str(room_map_file), "--align", "align.yaml", "--out", "room", *FEW]) == 0
     return folder / "room"
 
 
