@@ -93,6 +93,11 @@ def test_a_folder_or_a_device_is_not_replaced(path, make):
     assert {file.name for file in path.parent.iterdir()} == {"file", "other"}
 
 
+def test_a_file_that_cannot_be_written_is_named_and_not_its_name_of_chance():
+    with pytest.raises(OSError, match=r"'/proc/nothing'$"), replaced_file(Path("/proc/nothing")):
+        pass
+
+
 def test_no_name_can_be_planted(path):
     """A file in progress has a name that cannot be known, and is made anew, never opened."""
     names = set()
