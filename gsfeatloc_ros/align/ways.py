@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -37,15 +37,18 @@ from gsfeatloc_ros.ros_io.calibration_file import read_calibration
 from gsfeatloc_ros.ros_io.parameter_file import read_parameter_file
 from gsfeatloc_ros.ros_io.settings import Settings
 
+# Stamps in nanoseconds and T_robot_camera (4, 4).
+Poses = list[tuple[int, np.ndarray]]
+
 
 def by_trajectory(options: argparse.Namespace) -> Alignment:
     """Fit answers that are there to a trajectory."""
-    return _fitted(options, read_answers(options.answers))
+    return _fitted(options, _trajectory(options), read_answers(options.answers))
 
 
 def by_drive(options: argparse.Namespace) -> Alignment:
     """Localize the photos of a bag, and fit the answers to a trajectory."""
-    map_ = named_map(options)
+    map_, trajectory = named_map(options), _trajectory(options)
     if not options.camera_info and not options.calibration:
         raise ValueError("name the topic of camera_info, or a file with the calibration: --camera-info, --calibration")
     topics = {Role.IMAGE: options.image, Role.CAMERA_INFO: options.camera_info, Role.PRIOR: options.prior}
@@ -53,17 +56,20 @@ def by_drive(options: argparse.Namespace) -> Alignment:
     settings = replace(settings, node=replace(settings.node, max_rate=options.max_rate))
     settings = replace(settings, index=replace(settings.index, build=not options.prior))
     settings = replace(settings, image=replace(settings.image, rectified=options.rectified))
-    calibration = read_calibration(options.calibration) if options.calibration else None
+    calibration = read_calibration(options.calibration, options.rectified) if options.calibration else None
     named = {role: [topic] for role, topic in topics.items() if topic}
     with tqdm(localize_bag(options.bag, named, settings, calibration), unit="photo", disable=None) as progress:
         tried = list(progress)
     answers = [answer for answer in tried if answer is not None]
     print(f"localized {len(answers)} of {len(tried)} photos in the map as it lies now")
-    return _fitted(options, answers)
+    return _fitted(options, trajectory, answers)
 
 
-def _fitted(options: argparse.Namespace, answers: Sequence[Answer]) -> Alignment:
-    """Fit the answers to the trajectory that the options name."""
+def _trajectory(options: argparse.Namespace) -> Callable[[Sequence[Answer]], Poses]:
+    """Return what gives the robot's trajectory that the options name, for answers.
+
+    What is of no use in it is said now: the answers of a drive take minutes.
+    """
     mounted = _pose("--extrinsics", options.extrinsics)
     path = None
     if options.bag:
@@ -75,11 +81,20 @@ def _fitted(options: argparse.Namespace, answers: Sequence[Answer]) -> Alignment
                 raise ValueError("--body: name the bag whose tf tells where the camera is on it: --bag")
             mounted = path.mounted(options.body)
         poses = poses if mounted is None else [(stamp, pose @ mounted) for stamp, pose in poses]
-    elif path is not None:
-        poses = path.read([answer.stamp for answer in answers])
-    else:
+    elif path is None:
         raise ValueError("name the robot's trajectory: --trajectory FILE, or --bag BAG with --odom or --frame")
-    pairs = match(answers, Trajectory(poses, options.max_gap), oriented=not options.positions_only)
+    elif options.odom:
+        poses = path.read([])
+    else:
+        return lambda answers: path.read([answer.stamp for answer in answers])
+    return lambda answers: poses
+
+
+def _fitted(
+    options: argparse.Namespace, trajectory: Callable[[Sequence[Answer]], Poses], answers: Sequence[Answer]
+) -> Alignment:
+    """Fit answers to a trajectory."""
+    pairs = match(answers, Trajectory(trajectory(answers), options.max_gap), oriented=not options.positions_only)
     fit = fit_drive(pairs, options.seed)
     check(fit, Precision(options.max_scale_sd / 100, options.max_angle_sd))
     return Alignment(fit.S_robot_map, complete=True, report=list(report(fit)))
@@ -137,7 +152,7 @@ def by_target(options: argparse.Namespace) -> Alignment:
     else:
         if not (options.bag and options.image and options.answers):
             raise ValueError("name the photos: --scene SCENE, or --bag BAG with --image TOPIC and --answers FILE")
-        calibration = read_calibration(options.calibration) if options.calibration else None
+        calibration = read_calibration(options.calibration, options.rectified) if options.calibration else None
         topics = {Role.IMAGE: [options.image]}
         if options.camera_info:
             topics[Role.CAMERA_INFO] = [options.camera_info]

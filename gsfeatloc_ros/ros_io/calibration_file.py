@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from gsfeatloc_ros.common.yaml_file import read_yaml
+from gsfeatloc_ros.ros_io.calibration import decode_camera
 from gsfeatloc_ros.ros_io.message_types import Header, RegionOfInterest, Time
 
 
@@ -50,12 +51,26 @@ class FileCameraInfo:
     roi: RegionOfInterest = field(default_factory=_Region)
 
 
-def read_calibration(path: Path) -> FileCameraInfo:
-    """Read a calibration, as a message whose values `decode_camera` checks.
+def read_calibration(path: Path, rectified: bool = False) -> FileCameraInfo:
+    """Read a calibration, as a message that `decode_camera` takes.
+
+    Args:
+        path: of the file.
+        rectified: whether the images are.
 
     Raises:
-        ValueError: the file cannot be read, or is none; the message says why.
+        ValueError: the file cannot be read, is none, or is of no camera that can be used; the message says why.
     """
+    calibration = _read(path)
+    try:
+        decode_camera(calibration, rectified)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+    return calibration
+
+
+def _read(path: Path) -> FileCameraInfo:
+    """Return what a file holds, whatever that is worth."""
     try:
         content = read_yaml(path)
         if not isinstance(content, dict):

@@ -74,7 +74,7 @@ def _replay(options: argparse.Namespace) -> int:
         import_extra("matplotlib")  # to say now, not after an hour, that it is missing
     settings = _settings(options)
     limit_threads(settings.cpu.threads)
-    calibration = read_calibration(options.calibration) if options.calibration else None
+    calibration = read_calibration(options.calibration, settings.image.rectified) if options.calibration else None
     with open_bag(options.bag, _topics(options, settings)) as bag:
         replay = Replay(bag, _engine(settings), settings, calibration)
         options.out.mkdir(parents=True, exist_ok=True)

@@ -240,6 +240,8 @@ def test_a_calibration_in_a_file(tmp_path, rectified, focal):
         (CALIBRATION.replace("image_width", "width"), "lacks the key 'image_width'"),
         (CALIBRATION.replace("50, 0,", "50,"), ".* camera_matrix has 8 numbers, not 9"),
         (CALIBRATION.replace("64", "many"), "is no calibration"),
+        (CALIBRATION.replace("64", "-64"), ".* camera size -64x48 must be positive"),
+        (CALIBRATION.replace("plumb_bob", "mei"), ".* distortion model 'mei' is not one of"),
     ],
 )
 def test_calibrations_that_cannot_be_used(tmp_path, text, says):
