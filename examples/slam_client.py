@@ -37,6 +37,8 @@ from gsfeatloc_ros.common.geometry import invert, make_pose, matrix_from_quatern
 from gsfeatloc_ros.simulate import Room
 from gsfeatloc_ros.simulate.photos import Walk
 from gsfeatloc_ros.simulate.room_camera import RoomCamera
+from gsfeatloc_ros.tools.options import check_outputs, number
+from gsfeatloc_ros.tools.status import run_tool
 
 CAMERA = Camera(
     640,
@@ -289,14 +291,20 @@ def travel(slam: SlamStack, executor: SingleThreadedExecutor, seed: int, timeout
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the stack through the journey; return 0 if it tracks at the end."""
+    """Run the stack through the journey; return 0 if it tracks at the end, 2 where something cannot be used."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--service", default="/localizer/localize_image", help="to ask (%(default)s)")
-    parser.add_argument("--timeout", type=float, default=TIMEOUT, help="seconds for an answer (%(default)g)")
-    parser.add_argument("--seed", type=int, default=0, help="of the journey (%(default)s)")
+    parser.add_argument(
+        "--timeout", type=number(float, 0.1), default=TIMEOUT, help="seconds for an answer (%(default)g)"
+    )
+    parser.add_argument("--seed", type=number(int, 0), default=0, help="of the journey (%(default)s)")
     parser.add_argument("--json", type=Path, help="file of what it did")
     args = parser.parse_args(argv)
+    return run_tool("slam_client", lambda: _run(args))
 
+
+def _run(args: argparse.Namespace) -> int:
+    check_outputs(args.json)
     rclpy.init()
     _, start = next(journey(args.seed))
     slam = SlamStack(start, args.service, args.timeout)

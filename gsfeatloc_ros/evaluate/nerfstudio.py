@@ -86,7 +86,9 @@ def naming(path: Path) -> Iterator[None]:
         raise ValueError(f"{path}: cannot be read: {error.strerror or error}") from error
     except KeyError as error:
         raise ValueError(f"{path}: lacks the key {error}") from error
-    except (TypeError, ValueError, OverflowError, AttributeError) as error:
+    except (TypeError, OverflowError, AttributeError) as error:
+        raise ValueError(f"{path}: is not as nerfstudio writes it: {error}") from error
+    except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
 
 

@@ -24,6 +24,8 @@ _KINDS = {
     "sparse": colmap.load,
 }
 _MAPS = ("map.ply", "point_cloud.ply", "point_cloud/iteration_*/point_cloud.ply")
+# From the origin, in map units: what is computed of more overflows.
+_MAX_DISTANCE = 1e9
 _BLACK = (0.0, 0.0, 0.0)
 _WHITE = (1.0, 1.0, 1.0)
 
@@ -45,6 +47,9 @@ def load_scene(folder: str | Path, map_path: str | Path | None = None) -> Scene:
     if kind is None:
         raise ValueError(f"{folder}: holds none of {', '.join(_KINDS)}")
     photos, trajectory = _KINDS[kind](folder)
+    distance = np.abs(trajectory[:, :3, 3]).max()
+    if distance > _MAX_DISTANCE:
+        raise ValueError(f"{folder}: a photo was taken {distance:g} units from the origin, at most {_MAX_DISTANCE:g}")
     if len({photo.name for photo in photos}) < len(photos):
         photos = [replace(photo, name=photo.path.relative_to(folder).as_posix()) for photo in photos]
     missing = [photo.name for photo in photos if not photo.path.is_file()]

@@ -122,7 +122,9 @@ def _read(path: Path) -> dict[str, Any]:
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:
-        raise WeightsError(f"cannot read weights {path}: {error}") from error
+        # What torch says of foreign files is long, or nothing, and about torch.
+        reason = error.strerror if isinstance(error, OSError) else "is no file of weights that torch.save() wrote"
+        raise WeightsError(f"cannot read weights {path}: {reason}") from error
     if not isinstance(content, dict):
         raise WeightsError(f"cannot read weights {path}: it holds no weights but a {type(content).__name__}")
     return content

@@ -75,7 +75,8 @@ def written_video(path: Path, rate: float, size: tuple[int, int]) -> Iterator[Vi
     """
     if size[0] % 2 or size[1] % 2:
         raise ValueError(f"frames of {size[0]}x{size[1]} make no video: width and height must be even")
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), rate, size)
+    # Without the others that OpenCV would try: they complain on the terminal.
+    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*"mp4v"), rate, size)
     try:
         if not writer.isOpened():
             raise RuntimeError(f"{path}: no video can be written there, or this OpenCV has no writer of MP4")

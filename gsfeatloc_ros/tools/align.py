@@ -30,11 +30,10 @@ from gsfeatloc_ros.align.determination import Precision
 from gsfeatloc_ros.align.fit import UndeterminedError
 from gsfeatloc_ros.align.target import FAMILIES
 from gsfeatloc_ros.align.ways import by_distance, by_drive, by_gravity, by_target, by_trajectory, map_now
-from gsfeatloc_ros.common.kernel_cache import can_write
 from gsfeatloc_ros.localize.settings import MatcherSettings
 from gsfeatloc_ros.match import MATCHERS
 from gsfeatloc_ros.replay.truth import MAX_GAP
-from gsfeatloc_ros.tools.options import add_map_options, map_settings, number
+from gsfeatloc_ros.tools.options import add_map_options, check_outputs, map_settings, number
 from gsfeatloc_ros.tools.status import run_tool
 
 # The exit status where the data do not determine what is asked.
@@ -55,9 +54,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _align(options: argparse.Namespace) -> int:
     options.map_given = replace(map_settings(options), path=str(options.map or ""))
-    # Now, not after minutes.
-    if options.out.is_dir() or not can_write(options.out.absolute().parent):
-        raise ValueError(f"{options.out}: cannot be written: name another file (--out)")
+    check_outputs(options.out)
     try:
         alignment: Alignment = options.run(options)
     except UndeterminedError as error:

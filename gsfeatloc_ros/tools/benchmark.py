@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import sys
 from pathlib import Path
 from typing import Any
@@ -40,7 +41,7 @@ from gsfeatloc_ros.maps.ply import write_ply
 from gsfeatloc_ros.match import DEFAULT_MATCHER, MATCHERS
 from gsfeatloc_ros.render import DEVICES
 from gsfeatloc_ros.simulate.two_rooms import VIEWS, two_rooms
-from gsfeatloc_ros.tools.options import add_old_name, number
+from gsfeatloc_ros.tools.options import add_old_name, check_outputs, number, picture_size
 from gsfeatloc_ros.tools.status import run_tool
 
 
@@ -49,6 +50,7 @@ def main(arguments: list[str] | None = None) -> int:
     options = make_parser().parse_args(arguments)
 
     def run() -> int:
+        check_outputs(getattr(options, "out", None), getattr(options, "json", None))
         options.run(options)
         return 0
 
@@ -63,7 +65,7 @@ def make_parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", required=True)
     device = argparse.ArgumentParser(add_help=False)
     device.add_argument("--device", choices=DEVICES, default="auto", help="to render on (default: %(default)s)")
-    device.add_argument("--threads", type=int, default=0, help="CPU threads; 0 for one per core")
+    device.add_argument("--threads", type=number(int, 0), default=0, help="CPU threads; 0 for one per core")
     file = argparse.ArgumentParser(add_help=False)
     file.add_argument("--json", type=Path, metavar="FILE", help="write the figures here as well")
 
@@ -74,16 +76,18 @@ def make_parser() -> argparse.ArgumentParser:
         "--scene", type=Path, help="folder with a map and photos: a frame at the pose of each test photo"
     )
     frames.add_argument(
-        "--size", type=_size, default=(640, 480), metavar="WxH", help="of the frames (default: 640x480)"
+        "--size", type=picture_size, default=(640, 480), metavar="WxH", help="of the frames (default: 640x480)"
     )
     frames.add_argument(
         "--pose",
-        type=float,
+        type=number(float, -math.inf),
         nargs=7,
         metavar=("X", "Y", "Z", "QX", "QY", "QZ", "QW"),
         help="of the camera (z forward) in the map (default: the whole map in view)",
     )
-    frames.add_argument("--frames", type=int, default=20, help="measured at that pose (default: %(default)s)")
+    frames.add_argument(
+        "--frames", type=number(int, 1), default=20, help="measured at that pose (default: %(default)s)"
+    )
 
     render = commands.add_parser(
         "render", parents=[frames, device, file], help="time of a frame, and of loading the map of --map"
@@ -94,7 +98,7 @@ def make_parser() -> argparse.ArgumentParser:
         "opensplat", parents=[frames, file], help="time of a frame on the CPU against OpenSplat's, in turns"
     )
     opensplat.add_argument("--checkout", type=Path, required=True, help="of OpenSplat's sources, which are built")
-    opensplat.add_argument("--threads", type=int, default=0, help="CPU threads; 0 for one per core")
+    opensplat.add_argument("--threads", type=number(int, 0), default=0, help="CPU threads; 0 for one per core")
     opensplat.set_defaults(run=_opensplat)
 
     query = commands.add_parser("query", parents=[device, file], help="time of a localization, by stage")
@@ -103,7 +107,10 @@ def make_parser() -> argparse.ArgumentParser:
         "--matcher", choices=MATCHERS, default=DEFAULT_MATCHER, help="of features (default: %(default)s)"
     )
     query.add_argument(
-        "--sigma", type=float, default=1.0, help="scale of the priors' errors; 1 as in the paper (default: %(default)s)"
+        "--sigma",
+        type=number(float, 0),
+        default=1.0,
+        help="scale of the priors' errors; 1 as in the paper (default: %(default)s)",
     )
     query.set_defaults(run=_query)
 
@@ -111,12 +118,16 @@ def make_parser() -> argparse.ArgumentParser:
         "track", parents=[device, file], help="time of a localization, by stage, whose prior is good: small motion"
     )
     track.add_argument("--scene", type=Path, required=True, help="folder with a map and photos")
-    track.add_argument("--frames", type=int, default=60, help="along the simulated path (default: %(default)s)")
+    track.add_argument(
+        "--frames", type=number(int, 1), default=60, help="along the simulated path (default: %(default)s)"
+    )
     track.set_defaults(run=_track)
 
     synthetic = commands.add_parser("synthetic", help="make a map of two rooms to measure on")
-    synthetic.add_argument("--gaussians", type=int, default=1_000_000, help="their number (default: %(default)s)")
-    synthetic.add_argument("--seed", type=int, default=0, help="another one gives another map")
+    synthetic.add_argument(
+        "--gaussians", type=number(int, 1), default=1_000_000, help="their number (default: %(default)s)"
+    )
+    synthetic.add_argument("--seed", type=number(int, 0), default=0, help="another one gives another map")
     synthetic.add_argument("--out", type=Path, required=True, metavar="FILE.ply", help="the map")
     synthetic.set_defaults(run=_synthetic)
 
@@ -124,7 +135,7 @@ def make_parser() -> argparse.ArgumentParser:
     scaling.add_argument("--out", type=Path, required=True, metavar="FILE.png", help="the plot")
     max_gaussians = scaling.add_argument(
         "--max-gaussians",
-        type=int,
+        type=number(int, COUNTS[0]),
         default=COUNTS[-1],
         help="of the largest map; 5 million take 6 GB (default: %(default)s)",
     )
@@ -135,7 +146,7 @@ def make_parser() -> argparse.ArgumentParser:
     index.add_argument("--out", type=Path, required=True, metavar="FILE.png", help="the plot")
     index.add_argument(
         "--max-views",
-        type=int,
+        type=number(int, index_scaling.COUNTS[0]),
         default=index_scaling.COUNTS[-1],
         help="of the largest index; 50,000 take 4 GB (default: %(default)s)",
     )
@@ -149,8 +160,10 @@ def make_parser() -> argparse.ArgumentParser:
         metavar="LIST",
         help="of the second room's surfaces that other pictures cover, each in a map of its own (default: 0,0.02)",
     )
-    twins.add_argument("--photos", type=int, default=200, help="in each map (default: %(default)s)")
-    twins.add_argument("--seed", type=int, default=0, help="another one gives other rooms, photos and indices")
+    twins.add_argument("--photos", type=number(int, 1), default=200, help="in each map (default: %(default)s)")
+    twins.add_argument(
+        "--seed", type=number(int, 0), default=0, help="another one gives other rooms, photos and indices"
+    )
     twins.set_defaults(run=_twins)
 
     building = commands.add_parser("building", parents=[file], help="memory, starts, frames, queries of large maps")
@@ -201,8 +214,6 @@ def _opensplat(options: argparse.Namespace) -> None:
 
 
 def _check_frames(options: argparse.Namespace) -> None:
-    if options.frames < 1:
-        raise ValueError("--frames must be at least 1")
     if options.scene and options.pose:
         raise ValueError("--pose is for --map; the frames of a scene are at the poses of its photos")
 
@@ -214,8 +225,6 @@ def _query(options: argparse.Namespace) -> None:
 
 
 def _track(options: argparse.Namespace) -> None:
-    if options.frames < 1:
-        raise ValueError("--frames must be at least 1")
     settings = RendererSettings(device=options.device, threads=options.threads)
     report = measure_tracking(options.scene, options.frames, settings)
     print_tracking(report)
@@ -223,8 +232,6 @@ def _track(options: argparse.Namespace) -> None:
 
 
 def _synthetic(options: argparse.Namespace) -> None:
-    if options.gaussians < 1:
-        raise ValueError("--gaussians must be at least 1")
     write_ply(options.out, two_rooms(options.gaussians, options.seed))
     print(f"{options.out}: {options.gaussians} Gaussians. To measure on it:")
     for name, pose in VIEWS.items():
@@ -235,8 +242,6 @@ def _synthetic(options: argparse.Namespace) -> None:
 
 def _scaling(options: argparse.Namespace) -> None:
     counts = [count for count in COUNTS if count <= options.max_gaussians]
-    if not counts:
-        raise ValueError(f"--max-gaussians must be at least {COUNTS[0]}")
     rows = measure_scaling(counts)
     draw_scaling(rows, options.out)
     _write(options.json, {"rows": rows})
@@ -244,16 +249,12 @@ def _scaling(options: argparse.Namespace) -> None:
 
 def _index(options: argparse.Namespace) -> None:
     counts = [count for count in index_scaling.COUNTS if count <= options.max_views]
-    if not counts:
-        raise ValueError(f"--max-views must be at least {index_scaling.COUNTS[0]}")
     rows = index_scaling.measure_index(counts)
     index_scaling.draw_index(rows, options.out)
     _write(options.json, {"rows": rows})
 
 
 def _twins(options: argparse.Namespace) -> None:
-    if options.photos < 1:
-        raise ValueError("--photos must be at least 1")
     rows = measure_twins(options.share, options.photos, options.seed)
     print(twins_table(rows))
     _write(options.json, {"rows": rows})
@@ -274,13 +275,6 @@ def _shares(text: str) -> list[float]:
     if max(shares) > 1:
         raise argparse.ArgumentTypeError(f"{text} is not a list of numbers from 0 to 1")
     return shares
-
-
-def _size(text: str) -> tuple[int, int]:
-    width, _, height = text.partition("x")
-    if not (width.isdigit() and height.isdigit() and int(width) > 0 and int(height) > 0):
-        raise argparse.ArgumentTypeError(f"{text} is not a size like 640x480")
-    return int(width), int(height)
 
 
 if __name__ == "__main__":

@@ -28,7 +28,7 @@ from gsfeatloc_ros.match import DEFAULT_MATCHER, MATCHERS
 from gsfeatloc_ros.render import create_renderer
 from gsfeatloc_ros.simulate import Room, SimulatedPhoto, cover, simulate_photos, write_bag
 from gsfeatloc_ros.simulate.bag import CAMERA_INFO_TOPIC, IMAGE_TOPIC, PRIOR_TOPIC
-from gsfeatloc_ros.tools.options import add_old_name
+from gsfeatloc_ros.tools.options import add_old_name, number
 from gsfeatloc_ros.tools.status import run_tool
 
 MIN_SUCCESS_RATE = 0.95
@@ -47,10 +47,7 @@ _INDEX_TIMEOUT = 900.0
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the demo; return the exit status: 1 where it did not go well, 2 where something cannot be used."""
-    parser = make_parser()
-    args = parser.parse_args(argv)
-    if args.photos < 1:
-        parser.error("--photos must be at least 1")
+    args = make_parser().parse_args(argv)
     return run_tool("demo", lambda: _demo(args))
 
 
@@ -97,7 +94,7 @@ def make_parser() -> argparse.ArgumentParser:
         prog="gsfeatloc demo", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--out", type=Path, default=Path("demo_output"), help="folder of the results (%(default)s)")
-    photos = parser.add_argument("--photos", type=int, default=40, help="number of photos (%(default)s)")
+    photos = parser.add_argument("--photos", type=number(int, 1), default=40, help="number of photos (%(default)s)")
     add_old_name(parser, photos, "--queries")
     parser.add_argument(
         "--matcher", choices=sorted(MATCHERS), default=DEFAULT_MATCHER, help="of features (%(default)s)"

@@ -33,7 +33,7 @@ from gsfeatloc_ros.evaluate.suites import SUITES, Condition
 from gsfeatloc_ros.evaluate.tables import RunResults, describe, over_seeds, query_table, run_summary, run_table
 from gsfeatloc_ros.evaluate.trust import describe_trust, trust_table
 from gsfeatloc_ros.match import DEFAULT_MATCHER, MATCHERS
-from gsfeatloc_ros.tools.options import CollectSettings, add_old_name, localizer_options, number, setting
+from gsfeatloc_ros.tools.options import CollectSettings, add_old_name, check_outputs, localizer_options, number, setting
 from gsfeatloc_ros.tools.status import run_tool
 
 _NOTHING = "nothing"
@@ -54,6 +54,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _evaluate_and_write(options: argparse.Namespace, command: str) -> int:
     """Do what the options ask for; `command` is the command line that gave them."""
+    check_outputs(options.json)
     results = _evaluate(options)
     if options.json:
         content = describe(results)

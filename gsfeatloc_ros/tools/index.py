@@ -17,7 +17,6 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from gsfeatloc_ros.common.kernel_cache import can_write
 from gsfeatloc_ros.evaluate.scene import load_poses
 from gsfeatloc_ros.index import IndexOptions, ViewIndex, build_index
 from gsfeatloc_ros.index.storage import index_path, save_index
@@ -27,7 +26,7 @@ from gsfeatloc_ros.localize.settings import MatcherSettings, RendererSettings
 from gsfeatloc_ros.maps import Similarity
 from gsfeatloc_ros.match import MATCHERS
 from gsfeatloc_ros.render import DEVICES, Renderer
-from gsfeatloc_ros.tools.options import add_map_options, map_settings, number, print_reading
+from gsfeatloc_ros.tools.options import add_map_options, check_outputs, map_settings, number, print_reading
 from gsfeatloc_ros.tools.status import run_tool
 
 
@@ -50,12 +49,10 @@ def _index(options: argparse.Namespace) -> int:
 
 def _make(options: argparse.Namespace) -> tuple[Path, ViewIndex]:
     """Make the index that the options ask for, and write it; return where it is."""
+    check_outputs(options.out)
     map_ = map_settings(options).resolved()
     key = index_key(map_.path, map_, matcher_settings(options))
     path = options.out or index_path(map_.path)
-    # Now, not after minutes.
-    if path.is_dir() or not can_write(path.absolute().parent):
-        raise ValueError(f"{path}: cannot be written: name another file (--out)")
     poses = training_poses(options, map_.alignment())
     renderer = load_renderer(map_, RendererSettings(options.device, options.threads))
     print_reading("index", renderer)

@@ -26,7 +26,7 @@ from gsfeatloc_ros.inspect.page import as_page
 from gsfeatloc_ros.inspect.text import as_text
 from gsfeatloc_ros.localize.settings import RendererSettings
 from gsfeatloc_ros.render import DEVICES
-from gsfeatloc_ros.tools.options import add_map_options, map_settings, number
+from gsfeatloc_ros.tools.options import add_map_options, check_outputs, map_settings, number
 from gsfeatloc_ros.tools.status import run_tool
 
 
@@ -38,10 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _inspect(options: argparse.Namespace, command: str) -> int:
-    for path in filter(None, (options.json, options.html)):
-        # Now, not after the work.
-        if path.is_dir() or not path.absolute().parent.is_dir():
-            raise ValueError(f"{path}: cannot be written: name a file in a folder that is there")
+    check_outputs(options.json, options.html)
     scene = load_scene(options.photos, options.map) if options.photos else None
     with tqdm(desc="views", unit="view", disable=None, leave=False) as bar:
 

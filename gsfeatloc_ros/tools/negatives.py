@@ -19,6 +19,7 @@ from tqdm import tqdm
 from gsfeatloc_ros.evaluate.negatives import NegativeOptions, NegativeResult, localize_negatives, negative_table
 from gsfeatloc_ros.evaluate.scene import load_scene
 from gsfeatloc_ros.match import DEFAULT_MATCHER, MATCHERS
+from gsfeatloc_ros.tools.options import check_outputs, number
 from gsfeatloc_ros.tools.status import run_tool
 
 
@@ -33,6 +34,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _negatives(options: argparse.Namespace, matchers: Sequence[str]) -> int:
+    check_outputs(options.json)
     results = _localize(options, matchers)
     if options.json:
         rows = [result.row() for result in results]
@@ -60,12 +62,16 @@ def make_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("scene", type=Path, nargs="+", help="folder as for evaluate")
     parser.add_argument("--matcher", default=DEFAULT_MATCHER, help=f"of {', '.join(MATCHERS)}, or several")
-    parser.add_argument("--sigma", type=float, default=1.0, help="scale of the priors' errors (default: %(default)s)")
-    parser.add_argument("--seed", type=int, default=0, help="of the priors (default: %(default)s)")
+    parser.add_argument(
+        "--sigma", type=number(float, 0), default=1.0, help="scale of the priors' errors (default: %(default)s)"
+    )
+    parser.add_argument("--seed", type=number(int, 0), default=0, help="of the priors (default: %(default)s)")
     parser.add_argument(
         "--no-prior", action="store_true", help="look for them without a prior, by an index of the map's views"
     )
-    parser.add_argument("--limit", type=int, default=0, help="only the first photos of each scene; 0 for all")
+    parser.add_argument(
+        "--limit", type=number(int, 0), default=0, help="only the first photos of each scene; 0 for all"
+    )
     parser.add_argument("--json", type=Path, help="write the answers to this file")
     return parser
 

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import argparse
 import math
+import os
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
-from gsfeatloc_ros.common.parameter import Value, parameters_of, values_of
+from gsfeatloc_ros.common.kernel_cache import can_write
+from gsfeatloc_ros.common.parameter import Parameter, Value, parameters_of, values_of
 from gsfeatloc_ros.localize.options import LocalizerOptions
 from gsfeatloc_ros.localize.settings import MapSettings
 from gsfeatloc_ros.maps import ReadOptions
@@ -18,6 +21,8 @@ from gsfeatloc_ros.ros_io.parameter_file import parse_parameter
 
 # Have options of the commands of their own.
 _OWN_OPTIONS = ("max_image_width", "seed")
+# Larger pictures are a slip of the finger.
+_MAX_SIDE = 16384
 # Localizer options that are gone, and what to use instead.
 _RETIRED = dict.fromkeys(
     ("min_inlier_ratio", "min_correlation", "min_agreement"),
@@ -55,12 +60,10 @@ def add_node_parameters(parser: argparse.ArgumentParser, about: str) -> None:
     )
 
 
-def localizer_options() -> dict[str, type]:
-    """Return names and types of the parameters of LocalizerOptions that OPTION=VALUE changes."""
+def localizer_options() -> dict[str, Parameter]:
+    """Return the parameters of LocalizerOptions that OPTION=VALUE changes, by name."""
     return {
-        parameter.name: type(parameter.default)
-        for parameter in parameters_of(LocalizerOptions)
-        if parameter.name not in _OWN_OPTIONS
+        parameter.name: parameter for parameter in parameters_of(LocalizerOptions) if parameter.name not in _OWN_OPTIONS
     }
 
 
@@ -70,21 +73,37 @@ def setting(parse: Callable[[Callable[[str], float]], Callable[[str], Any]]) -> 
     Args:
         parse: makes the parser of VALUE from that of a number of the option's type.
     """
-    kinds = localizer_options()
+    options = localizer_options()
 
     def parse_setting(text: str) -> tuple[str, Any]:
         name, equals, value = text.partition("=")
         if name in _RETIRED:
             raise argparse.ArgumentTypeError(f"{name} is no option any more: use {_RETIRED[name]}")
-        if not equals or name not in kinds:
-            raise argparse.ArgumentTypeError(f"{text} is not OPTION=VALUE with an option out of {', '.join(kinds)}")
-        return name, parse(number(kinds[name], -math.inf))(value)
+        if not equals or name not in options:
+            raise argparse.ArgumentTypeError(f"{text} is not OPTION=VALUE with an option out of {', '.join(options)}")
+        return name, parse(_value_of(options[name]))(value)
 
     return parse_setting
 
 
+def _value_of(parameter: Parameter) -> Callable[[str], float]:
+    """Make the parser of a number that a parameter takes."""
+
+    def parse(text: str) -> float:
+        value = number(int if isinstance(parameter.default, int) else float, -math.inf)(text)
+        try:
+            parameter.converted(value)
+        except ValueError as error:
+            raise argparse.ArgumentTypeError(str(error)) from error
+        return value
+
+    return parse
+
+
 def number(kind: Callable[[str], float], minimum: float) -> Callable[[str], float]:
-    """Make the parser of a finite number of at least `minimum`."""
+    """Make the parser of a finite number, a whole one where `kind` is int, of at least `minimum`."""
+    name = "whole number" if kind is int else "number"
+    wanted = f"a {name} of at least {minimum:g}" if math.isfinite(minimum) else f"a {name}"
 
     def parse(text: str) -> float:
         try:
@@ -92,10 +111,31 @@ def number(kind: Callable[[str], float], minimum: float) -> Callable[[str], floa
         except ValueError:
             value = math.nan
         if not (math.isfinite(value) and value >= minimum):
-            raise argparse.ArgumentTypeError(f"{text!r} is not a number of at least {minimum}")
+            raise argparse.ArgumentTypeError(f"{text!r} is not {wanted}")
         return value
 
     return parse
+
+
+def picture_size(text: str) -> tuple[int, int]:
+    """Parse width and height of a picture, as 640x480."""
+    width, _, height = text.partition("x")
+    if not all(side.isdecimal() and 0 < int(side) <= _MAX_SIDE for side in (width, height)):
+        raise argparse.ArgumentTypeError(f"{text} is not a size like 640x480, of at most {_MAX_SIDE}")
+    return int(width), int(height)
+
+
+def check_outputs(*paths: Path | None) -> None:
+    """Raise ValueError where a file that is to be written cannot be: now, not after the work. None is no file."""
+    for path in filter(None, paths):
+        folder = path.absolute().parent
+        if path.is_dir():
+            raise ValueError(f"{path}: cannot be written, it is a folder: name another file")
+        if not folder.is_dir():
+            raise ValueError(f"{path}: cannot be written, there is no folder {folder}: name another file")
+        # /dev/stdout, say, is there, where no other can be made.
+        if not can_write(folder) and not os.access(path, os.W_OK):
+            raise ValueError(f"{path}: cannot be written: name another file")
 
 
 def add_map_options(parser: argparse.ArgumentParser) -> None:

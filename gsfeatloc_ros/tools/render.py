@@ -30,13 +30,18 @@ from gsfeatloc_ros.render import DEVICES
 from gsfeatloc_ros.render.picture_files import write_pictures, written_video
 from gsfeatloc_ros.ros_io.calibration import decode_camera
 from gsfeatloc_ros.ros_io.calibration_file import read_calibration
-from gsfeatloc_ros.tools.options import add_map_options, map_settings, number, print_reading
+from gsfeatloc_ros.tools.options import (
+    add_map_options,
+    check_outputs,
+    map_settings,
+    number,
+    picture_size,
+    print_reading,
+)
 from gsfeatloc_ros.tools.status import run_tool
 
 # Millimetres of a metre.
 _DEPTH_SCALE = 1000.0
-# Larger pictures are a slip of the finger.
-_MAX_SIDE = 16384
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -55,9 +60,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _render(options: argparse.Namespace) -> int:
-    for path in filter(None, (options.out, options.video)):
-        if not path.absolute().parent.is_dir():
-            raise ValueError(f"{path}: there is no folder {path.absolute().parent}")
+    # --out is the beginning of names.
+    check_outputs(options.out and options.out.with_name(f"{options.out.name}.png"), options.video)
     camera = _camera(options)
     poses = [pose for _, pose in read_tum(options.path)] if options.path else [pose_from_numbers(options.pose[-7:])]
     renderer = load_renderer(map_settings(options), RendererSettings(options.device, options.threads))
@@ -102,7 +106,9 @@ def make_parser() -> argparse.ArgumentParser:
     cameras = parser.add_mutually_exclusive_group(required=True)
     cameras.add_argument("--camera", type=Path, metavar="FILE", help="calibration, as camera_calibration writes it")
     cameras.add_argument("--fov", type=_field_of_view, metavar="DEG", help="horizontal field of view, with --size")
-    parser.add_argument("--size", type=_size, metavar="WxH", help="of the pictures, pixels (default: the camera's)")
+    parser.add_argument(
+        "--size", type=picture_size, metavar="WxH", help="of the pictures, pixels (default: the camera's)"
+    )
     parser.add_argument("--out", type=Path, metavar="PREFIX", help="of the pictures' paths")
     parser.add_argument(
         "--depth-scale",
@@ -124,13 +130,6 @@ def _field_of_view(text: str) -> float:
     if degrees > 170:
         raise argparse.ArgumentTypeError(f"{text} is more than 170 degrees")
     return degrees
-
-
-def _size(text: str) -> tuple[int, int]:
-    width, _, height = text.partition("x")
-    if not all(side.isdecimal() and 0 < int(side) <= _MAX_SIDE for side in (width, height)):
-        raise argparse.ArgumentTypeError(f"{text} is not a size like 640x480, of at most {_MAX_SIDE}")
-    return int(width), int(height)
 
 
 if __name__ == "__main__":

@@ -34,7 +34,7 @@ from gsfeatloc_ros.client.observer import Observer
 from gsfeatloc_ros.client.process import isolate_ros, running_localizer
 from gsfeatloc_ros.client.robot import Stream, prepare_room, run_robot
 from gsfeatloc_ros.client.soak_report import add_core_target, add_floods, summarize
-from gsfeatloc_ros.tools.options import add_node_parameters
+from gsfeatloc_ros.tools.options import add_node_parameters, check_outputs, number, picture_size
 from gsfeatloc_ros.tools.status import run_tool
 
 
@@ -45,6 +45,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _soak(args: argparse.Namespace) -> int:
+    check_outputs(args.json)
     print(f"soak: the map and the photos are kept in {args.folder}", file=sys.stderr)
     stream = Stream(args.size, args.rate, args.seconds, args.track)
     map_file, photos_file = prepare_room(args.folder, stream)
@@ -100,10 +101,10 @@ def make_parser() -> argparse.ArgumentParser:
         prog="gsfeatloc soak", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument(
-        "--seconds", type=float, default=600, help="how long (%(default)g); memory still settles before 300"
+        "--seconds", type=number(float, 1), default=600, help="how long (%(default)g); memory still settles before 300"
     )
-    parser.add_argument("--size", type=_size, default="640x480", help="of the images in pixels (%(default)s)")
-    parser.add_argument("--rate", type=float, default=10.0, help="images a second (%(default)g)")
+    parser.add_argument("--size", type=picture_size, default="640x480", help="of the images in pixels (%(default)s)")
+    parser.add_argument("--rate", type=number(float, 0.1), default=10.0, help="images a second (%(default)g)")
     parser.add_argument("--folder", type=Path, default=Path("soak"), help="keeps the map and the photos (%(default)s)")
     parser.add_argument(
         "--flood",
@@ -118,13 +119,6 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument("--faults", action="store_true", help="make a fault every two seconds")
     parser.add_argument("--json", type=Path, help="file of the results")
     return parser
-
-
-def _size(text: str) -> tuple[int, int]:
-    width, cross, height = text.partition("x")
-    if not (cross and width.isdecimal() and height.isdecimal()):
-        raise argparse.ArgumentTypeError(f"{text!r} is not WIDTHxHEIGHT")
-    return int(width), int(height)
 
 
 def _flood(text: str) -> Flood:

@@ -20,7 +20,6 @@ from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gsfeatloc_ros.common.kernel_cache import can_write
 from gsfeatloc_ros.evaluate.extras import import_extra
 from gsfeatloc_ros.localize.settings import MapSettings
 from gsfeatloc_ros.maps import load_map
@@ -29,7 +28,7 @@ from gsfeatloc_ros.replay.bag import Role
 from gsfeatloc_ros.ros_io.calibration_file import read_calibration
 from gsfeatloc_ros.ros_io.parameter_file import read_parameter_file
 from gsfeatloc_ros.ros_io.settings import Settings
-from gsfeatloc_ros.tools.options import add_map_options, given_map, number, print_reading
+from gsfeatloc_ros.tools.options import add_map_options, check_outputs, given_map, number, print_reading
 from gsfeatloc_ros.tools.status import run_tool
 from gsfeatloc_ros.view.attempts import read_replay
 from gsfeatloc_ros.view.recorded import read_recording
@@ -61,8 +60,7 @@ def _view(options: argparse.Namespace) -> int:
     from gsfeatloc_ros.view.page import Page, PageOptions
     from gsfeatloc_ros.view.server import PageServer
 
-    if options.out and (options.out.is_dir() or not can_write(options.out.absolute().parent)):
-        raise ValueError(f"{options.out}: cannot be written: name another file (--out)")
+    check_outputs(options.out)
     store, map_ = Store(), _map(options)
     if options.answers:
         _read_answers(options, store)

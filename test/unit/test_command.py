@@ -32,7 +32,9 @@ COMMAND_LINES = {
     "prepare": ["BAD --out OUT", "MAP --out OUT --align BAD", "MAP --out OUT --poses BAD"],
     "align": [
         "trajectory --answers BAD --trajectory BAD --out OUT",
-        "drive BAD --map MAP --image /i --camera-info /c --out OUT",
+        "drive BAD --map MAP --image /i --camera-info /c --odom /o --out OUT",
+        # The trajectory is looked at before the photos are localized.
+        "drive NOWHERE --map MAP --image /i --camera-info /c --trajectory BAD --out OUT",
         "gravity --map MAP --answers BAD --level --out OUT",
         "target --scene BAD --tag 36h11 --size 0.1 --out OUT",
     ],
@@ -106,6 +108,51 @@ def test_help_says_how_the_tool_is_called(name, capsys) -> None:
     assert "python -m" not in text
 
 
+# In each OUT cannot be written. That is said first: there is no MAP, no SCENE, and what is measured takes minutes.
+OUTPUTS = [
+    "inspect MAP --json OUT",
+    "inspect MAP --html OUT",
+    "view MAP --out OUT",
+    "render MAP --pose 0 0 0 0 0 0 1 --fov 60 --size 64x48 --out OUT",
+    "render MAP --path MAP --fov 60 --size 64x48 --video OUT",
+    "index MAP --out OUT",
+    "align trajectory --answers MAP --trajectory MAP --out OUT",
+    "align distance --points 0 0 0 1 0 0 --distance 1 --out OUT",
+    "evaluate SCENE --json OUT",
+    "negatives SCENE --json OUT",
+    "benchmark render --map MAP --json OUT",
+    "benchmark query --scene SCENE --json OUT",
+    "benchmark synthetic --out OUT",
+    "benchmark scaling --out OUT",
+    "benchmark index --out OUT",
+    "benchmark twins --json OUT",
+    "soak --json OUT",
+]
+# Options with numbers that they do not take.
+NUMBERS = [
+    "evaluate SCENE --limit -1",
+    "evaluate SCENE --sigma nan",
+    "negatives SCENE --limit -1",
+    "negatives SCENE --sigma inf",
+    "negatives SCENE --seed -1",
+    "benchmark render --map MAP --frames 0",
+    "benchmark render --map MAP --threads -1",
+    "benchmark render --map MAP --size 640x99999",
+    "benchmark render --map MAP --pose 0 0 0 0 0 0 nan",
+    "benchmark query --scene SCENE --sigma nan",
+    "benchmark track --scene SCENE --frames 0",
+    "benchmark synthetic --gaussians 0 --out OUT",
+    "benchmark synthetic --seed -1 --out OUT",
+    "benchmark scaling --max-gaussians 1 --out OUT",
+    "benchmark index --max-views 1 --out OUT",
+    "benchmark twins --photos 0",
+    "demo --photos 0",
+    "soak --seconds nan",
+    "soak --rate 0",
+    "soak --size 640x0",
+]
+
+
 @pytest.fixture
 def places(tmp_path) -> dict[str, str]:
     write_ply(tmp_path / "map.ply", random_map(50, 0, seed=0))
@@ -131,6 +178,39 @@ def test_what_cannot_be_used_is_named_in_one_line_with_status_2(line, kind, plac
     assert reason.startswith(f"{name}: ")
     assert bad in reason
     assert "Traceback" not in "".join(notes)
+
+
+@pytest.mark.parametrize("out", ["folder", "missing/out", "empty/out", "/proc/out"])
+@pytest.mark.parametrize("line", OUTPUTS)
+def test_an_output_that_cannot_be_written_is_named_before_the_work(line, out, places, tmp_path, capfd) -> None:
+    name, *words = line.split()
+    if name in NEED_ROS:
+        pytest.importorskip("rclpy")
+    if out == "folder" and "render MAP --pose" in line:
+        pytest.skip("it is the beginning of names: folder.png")
+    named = {"MAP": places["missing"], "SCENE": places["missing"], "OUT": str(tmp_path / out)}
+    tool = importlib.import_module(f"gsfeatloc_ros.tools.{name}")
+    try:
+        status = tool.main([named.get(word, word) for word in words])
+    except SystemExit as ended:
+        status = ended.code
+    assert status == 2
+    reason = capfd.readouterr().err.splitlines()[-1]
+    assert str(tmp_path / out) in reason
+    assert "cannot be written" in reason or "there is no folder" in reason
+    assert not (tmp_path / "missing").exists()
+
+
+@pytest.mark.parametrize("line", NUMBERS)
+def test_a_number_that_an_option_does_not_take_is_named(line, capsys) -> None:
+    name, *words = line.split()
+    if name in NEED_ROS:
+        pytest.importorskip("rclpy")
+    with pytest.raises(SystemExit, match="2"):
+        importlib.import_module(f"gsfeatloc_ros.tools.{name}").main(words)
+    reason = capsys.readouterr().err.splitlines()[-1]
+    option = next(word for word in reversed(words) if word.startswith("--") and word != "--out")
+    assert f"error: argument {option}: " in reason
 
 
 def test_every_tool_is_tried_with_what_cannot_be_used() -> None:

@@ -22,6 +22,9 @@ from gsfeatloc_ros.match import create_matcher
 from gsfeatloc_ros.render import create_renderer
 from gsfeatloc_ros.simulate import simulate_photos
 
+FAR = np.eye(4)
+FAR[2, 3] = 1e300
+
 # nerfstudio
 
 
@@ -109,6 +112,11 @@ def test_photo_with_alpha_lies_on_white(tmp_path, transforms):
         ({"frames": [{"file_path": "images/b.png", "transform_matrix": np.diag([1, 1, -1, 1]).tolist()}]}, "rigid"),
         ({"frames": [{"file_path": "images/b.png", "transform_matrix": [[float("nan")] * 4] * 4}]}, "finite"),
         ({"frames": [{"file_path": "images/b.png"}]}, "transform_matrix"),
+        ({"frames": [1]}, "is not as nerfstudio writes it"),
+        (
+            {"frames": [{"file_path": "images/b.png", "transform_matrix": FAR.tolist()}]},
+            r"1e\+300 units from the origin",
+        ),
     ],
 )
 def test_scene_that_cannot_be_used(tmp_path, transforms, change, message):

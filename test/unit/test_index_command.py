@@ -47,7 +47,7 @@ def test_the_index_lies_where_the_node_looks_for_it_and_is_what_it_expects(map_p
 
 
 def test_another_seed_gives_another_index_where_it_was_asked_for(map_path, tmp_path) -> None:
-    files = [tmp_path / "made" / f"{seed}.index" for seed in "01"]
+    files = [tmp_path / f"{seed}.index" for seed in "01"]
     for seed, file in zip("01", files, strict=True):
         assert index.main([str(map_path), *FEW, "--seed", seed, "--threads", "1", "--out", str(file)]) == 0
     one, other = (load_index(file, key_of(map_path)) for file in files)

@@ -17,7 +17,7 @@ def map_file(tmp_path):
 
 def test_a_file_that_cannot_be_written_is_said_before_the_page_is_served(map_file, tmp_path, capsys):
     assert main([map_file, "--out", str(tmp_path)]) == 2
-    assert capsys.readouterr().err == f"view: {tmp_path}: cannot be written: name another file (--out)\n"
+    assert capsys.readouterr().err == f"view: {tmp_path}: cannot be written, it is a folder: name another file\n"
 
 
 @pytest.mark.parametrize("options", [["--bag", "bag"], ["--live", "--answers", "replayed"], ["--port", "x"]])
