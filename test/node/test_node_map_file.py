@@ -133,7 +133,18 @@ def delete(path: Path) -> None:
     path.unlink()
 
 
-SPOILERS = [truncate, empty, overwrite, overwrite_values, delete]
+def put_a_pipe(path: Path) -> None:
+    """Of which nobody writes the other end."""
+    path.unlink()
+    os.mkfifo(path)
+
+
+SPOILERS = [truncate, empty, overwrite, overwrite_values, delete, put_a_pipe]
+
+
+def restore(path: Path, room_map_file: Path) -> None:
+    path.unlink(missing_ok=True)
+    shutil.copy(room_map_file, path)
 
 
 # Before the others: it runs a localizer of its own.
@@ -149,7 +160,7 @@ def test_signal_while_a_map_is_loaded(room_map_file, moved_map_file):
 
 @pytest.mark.parametrize("spoil", SPOILERS)
 def test_map_file_is_spoilt_while_in_use(client, map_file, room_map_file, photo, spoil: Callable[[Path], None]):
-    shutil.copy(room_map_file, map_file)
+    restore(map_file, room_map_file)
     cache = map_file.with_name(map_file.name + SUFFIX)
     cache.write_bytes(b"garbage")
     spoil(map_file)
@@ -177,7 +188,7 @@ def test_path_of_no_map(client, map_file, photo, path):
 
 
 def test_spoilt_cache_is_not_used(client, map_file, room_map_file, photo):
-    shutil.copy(room_map_file, map_file)
+    restore(map_file, room_map_file)
     cache = map_file.with_name(map_file.name + SUFFIX)
     cache.write_bytes(np.random.default_rng(0).bytes(100_000))
     seen = len(client.maps)
@@ -189,7 +200,7 @@ def test_spoilt_cache_is_not_used(client, map_file, room_map_file, photo):
 
 def test_another_map_serves_once_it_is_loaded(client, map_file, room_map_file, moved_map_file, photo):
     """Until then the old one does."""
-    shutil.copy(room_map_file, map_file)
+    restore(map_file, room_map_file)
     assert_answer(client, photo)
     seen, answered_meanwhile = len(client.maps), 0
     assert client.set_parameter("map.path", str(moved_map_file)).successful

@@ -13,6 +13,7 @@ from rcl_interfaces.srv import DescribeParameters
 from sensor_msgs.msg import Image
 
 from gsfeatloc_ros.client.messages import camera_info_of, pose_stamped, pose_with_covariance, rgb_image, stamp_of
+from gsfeatloc_ros.ros_io.settings import PARAMETERS
 
 
 @pytest.fixture
@@ -85,6 +86,21 @@ def test_options_of_the_localizer_change_while_it_runs(client, photo):
     assert "at least 800 needed" in refused.reason
     for name, value in {"localizer.min_inliers": 20, "localizer.max_views": 32}.items():
         assert client.set_parameter(name, value).successful
+    assert client.attempt(rgb_image(photo.image)).ok
+
+
+@pytest.mark.nightly
+def test_whatever_number_is_allowed_leads_to_an_answer_or_a_reason(client, photo):
+    """The least and the greatest of each that can be set while it runs; with its default all is as it was."""
+    client.send_prior(pose_stamped(photo.T_map_camera_prior))
+    numbers = [item for item in PARAMETERS if item.live and item.bounds is not None]
+    assert len(numbers) > 20
+    for item in numbers:
+        for bound in item.bounds:
+            assert client.set_parameter(item.name, type(item.default)(bound)).successful, (item.name, bound)
+            said = client.attempt(rgb_image(photo.image))
+            assert said.values["status"] in ("localized", "rejected", "failed"), (item.name, bound, said.reason)
+        assert client.set_parameter(item.name, item.default).successful
     assert client.attempt(rgb_image(photo.image)).ok
 
 
