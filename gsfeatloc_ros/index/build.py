@@ -47,19 +47,20 @@ def build_index(
     Args:
         renderer: of the map.
         matcher: whose features the views are kept by.
-        options: how many views.
+        options: how many views, and whether a robot on a plane looks at them.
         progress: called with the number of views looked at and of all that will be.
         interrupted: whether to give up, asked before each view.
         poses: (P, 4, 4) T_map_camera of the map's photos, if known: views are chosen to suit these.
 
     Raises:
         Interrupted: `interrupted` said so.
-        ValueError: nothing in the map can be seen or recognized, or the matcher has no descriptors.
+        ValueError: nothing in the map can be seen or recognized, from the camera's height if that is given, or the
+            matcher has no descriptors.
     """
     rng = np.random.default_rng(options.seed)
     points = renderer.solid_points
     given = np.empty((0, 4, 4)) if poses is None else np.asarray(poses, np.float64)
-    drawn, distances = random_poses(points, _CANDIDATES_PER_VIEW * options.views, rng)
+    drawn, targets = random_poses(points, _CANDIDATES_PER_VIEW * options.views, rng, options)
     candidates = np.concatenate([given, drawn])
     total = len(candidates) + min(_SHORTLIST * options.views, len(candidates))
 
@@ -73,8 +74,13 @@ def build_index(
     for number, pose in enumerate(candidates):
         check(number)
         render = renderer.render(SMALL_VIEW, pose)
-        free = number < len(given) or sees(render, distances[number - len(given)])
+        free = number < len(given) or sees(render, SMALL_VIEW, pose, targets[number - len(given)])
         seen.append(seen_cells(render, SMALL_VIEW, pose, near) if free else set())
+    if options.on_plane and not any(seen):
+        raise ValueError(
+            f"nothing of the map is seen from {options.camera_height:g} above its plane z = 0: index.camera_height and "
+            "index.camera_pitch are those of the camera in the aligned map"
+        )
     photos = np.arange(len(candidates)) if poses is None else np.arange(len(given))
     photos = photos[:: -(-len(photos) // _MAX_PHOTOS)]
     worth = overlap([seen[photo] for photo in photos], seen)

@@ -18,3 +18,15 @@ class IndexOptions:
     )
     views: int = parameter(480, "Number of views in an index that is made.", (1, 100_000))
     seed: int = parameter(0, "Seed of the places of the views.", (0, 2**31 - 1))
+    camera_height: float = parameter(
+        0.0,
+        "Height in metres, above the map's plane z = 0, of the camera of a robot that stays on it: views are placed "
+        "there. 0 for anywhere. Needs map.aligned.",
+        (0.0, 1000.0),
+    )
+    camera_pitch: float = parameter(0.0, "By how many degrees that camera looks up, or, negative, down.", (-90.0, 90.0))
+
+    @property
+    def on_plane(self) -> bool:
+        """Whether views are placed where the camera of a robot on the plane z = 0 is."""
+        return self.camera_height > 0

@@ -10,7 +10,8 @@ from scipy.sparse import csr_array
 
 from gsfeatloc_ros.common.arrays import to_host
 from gsfeatloc_ros.common.camera import Camera
-from gsfeatloc_ros.common.geometry import make_pose
+from gsfeatloc_ros.common.geometry import invert, make_pose, transform
+from gsfeatloc_ros.index.options import IndexOptions
 from gsfeatloc_ros.render.base import Render
 
 # Cameras of views, and of those that are looked at small; hardly anything may be nearer to one than this share of the
@@ -41,11 +42,14 @@ _CELL = 0.25
 _DIRECTIONS = 12
 
 
-def random_poses(points: np.ndarray, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Draw poses (count, 4, 4), T_map_camera, each aimed at one of the points (N, 3), and the distances (count,) to it.
+def random_poses(
+    points: np.ndarray, count: int, rng: np.random.Generator, options: IndexOptions
+) -> tuple[np.ndarray, np.ndarray]:
+    """Draw poses (count, 4, 4), T_map_camera, each aimed at one of the points (N, 3), and these points (count, 3).
 
     Half of them lie anywhere in the box of the points, as cameras in rooms do; half at any distance from what they look
-    at, as those round an object do.
+    at, as those round an object do. Of a robot on a plane all have the camera's height and pitch and only face what
+    they are aimed at.
 
     Raises:
         ValueError: there is no point.
@@ -60,8 +64,11 @@ def random_poses(points: np.ndarray, count: int, rng: np.random.Generator) -> tu
     away /= np.linalg.norm(away, axis=1, keepdims=True)
     distances = radius(points) * np.exp(rng.uniform(np.log(_DISTANCES[0]), np.log(_DISTANCES[1]), (count, 1)))
     positions = np.where(rng.random((count, 1)) < 0.5, inside, targets + distances * away)
-    poses = np.array([_aimed(*pair, rng) for pair in zip(positions, targets, strict=True)])
-    return poses, np.linalg.norm(targets - positions, axis=1)
+    aims = targets - positions
+    if options.on_plane:
+        positions[:, 2] = options.camera_height
+        aims[:, 2] = np.tan(np.radians(options.camera_pitch)) * np.linalg.norm(aims[:, :2], axis=1)
+    return np.array([_aimed(*pair, rng) for pair in zip(positions, aims, strict=True)]), targets
 
 
 def radius(points: np.ndarray) -> float:
@@ -70,11 +77,23 @@ def radius(points: np.ndarray) -> float:
     return 0.5 * float(np.linalg.norm(high - low))
 
 
-def sees(render: Render, distance: float) -> bool:
-    """Return whether what lies ahead is about so far away: behind a wall, or inside a thing, it is not."""
-    height, width = render.alpha.shape
-    ahead = float(render.median_depth[height // 2, width // 2])
-    return abs(ahead - distance) <= _MAX_DISTANCE_ERROR * distance
+def sees(render: Render, camera: Camera, T_map_camera: np.ndarray, target: np.ndarray) -> bool:
+    """Return whether a view shows what it is aimed at: from behind a wall, or inside a thing, it does not.
+
+    Args:
+        render: of the view.
+        camera: of the view.
+        T_map_camera: (4, 4) its pose.
+        target: (3,) a point of the map.
+    """
+    there = transform(invert(T_map_camera), target[None])
+    depth = there[0, 2]
+    if depth <= 0:
+        return False
+    x, y = camera.project(there)[0].round()
+    if not (0 <= x < camera.width and 0 <= y < camera.height):
+        return False
+    return bool(abs(float(render.median_depth[int(y), int(x)]) - depth) <= _MAX_DISTANCE_ERROR * depth)
 
 
 def seen_cells(render: Render, camera: Camera, T_map_camera: np.ndarray, near: float) -> set[int]:
@@ -158,10 +177,9 @@ def _box(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return low, high
 
 
-def _aimed(position: np.ndarray, target: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return the pose (4, 4) of a camera at `position` (3,) that looks at `target` (3,), nearly upright."""
-    z = target - position
-    z = z / np.linalg.norm(z) if z.any() else np.array([1.0, 0.0, 0.0])
+def _aimed(position: np.ndarray, aim: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Return the pose (4, 4) of a camera at `position` (3,) that looks along `aim` (3,), nearly upright."""
+    z = aim / np.linalg.norm(aim) if aim.any() else np.array([1.0, 0.0, 0.0])
     x = np.cross(z, _UP + _MAX_TILT * rng.normal(size=3))
     x /= np.linalg.norm(x)
     return make_pose(np.column_stack([x, np.cross(z, x), z]), position)

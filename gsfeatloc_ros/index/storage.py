@@ -89,7 +89,7 @@ def load_index(path: Path, key: dict[str, Any] | None = None) -> ViewIndex | Non
 
     Args:
         path: its file.
-        key: what it has to be made of; None takes any.
+        key: what it has to be made of, whatever else it says that it was; None takes any.
 
     Returns:
         The index; None where there is no such file or it was made of something else.
@@ -119,12 +119,12 @@ def _read(stream: BinaryIO, path: Path, key: dict[str, Any] | None) -> ViewIndex
     try:
         header = json.loads(encoded)
         sizes = {name: int(header["sizes"][name]) for name in _SIZES}
-        stored = header["key"]
+        stored = dict(header["key"])
     except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
         raise damaged from error
     if not all(least <= sizes[name] <= most for name, (least, most) in _SIZES.items()):
         raise damaged
-    if key is not None and stored != key:
+    if key is not None and stored != {**stored, **key}:
         return None
     shapes = {
         name: tuple(sizes[size] if isinstance(size, str) else size for size in shape)

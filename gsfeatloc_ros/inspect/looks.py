@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gsfeatloc_ros.index import IndexOptions
 from gsfeatloc_ros.index.placement import NEAR, SMALL_VIEW, cover, overlap, radius, random_poses, seen_cells, sees
 from gsfeatloc_ros.render import Render, Renderer
 
@@ -29,13 +30,13 @@ def look_around(
         ValueError: nothing in the map is solid.
     """
     points = renderer.solid_points
-    poses, distances = random_poses(points, count, np.random.default_rng(seed))
+    poses, targets = random_poses(points, count, np.random.default_rng(seed), IndexOptions())
     near = NEAR * radius(points)
     looks = []
-    for number, (pose, distance) in enumerate(zip(poses, distances, strict=True)):
+    for number, (pose, target) in enumerate(zip(poses, targets, strict=True)):
         progress(number, count)
         render = renderer.render(SMALL_VIEW, pose).on_host()
-        cells = seen_cells(render, SMALL_VIEW, pose, near) if sees(render, distance) else set()
+        cells = seen_cells(render, SMALL_VIEW, pose, near) if sees(render, SMALL_VIEW, pose, target) else set()
         if cells:
             looks.append(Look(pose, render, cells))
     progress(count, count)

@@ -28,7 +28,8 @@ def index_for(
 ) -> ViewIndex | None:
     """Read the index of an engine's map; where there is none of this map, make it and write it.
 
-    How many views it has, and whether it was made with training poses, does not matter: what is there is used.
+    How many views it has, and whether it was made with training poses, does not matter: what is there is used. Nor does
+    where the views are placed, unless the options say where.
 
     Args:
         engine: of the map.
@@ -75,10 +76,14 @@ def _usable(path: Path, key: dict[str, Any]) -> ViewIndex | None:
     return found
 
 
-def index_key(map_path: str, map_: MapSettings, matcher: MatcherSettings) -> dict[str, Any]:
-    """Return what an index is of: the map, how it is read, where it lies, and the features; ready for JSON."""
+def index_key(map_path: str, map_: MapSettings, matcher: MatcherSettings, options: IndexOptions) -> dict[str, Any]:
+    """Return what an index is of: the map, how it is read, where it lies, the features, and the plane if there is one.
+
+    It is ready for JSON.
+    """
     placed = map_.alignment()
-    return {
+    plane = {"plane": [options.camera_height, options.camera_pitch]} if options.on_plane else {}
+    return plane | {
         "map": map_content(map_path),
         "reading": asdict(map_.reading),
         "alignment": np.hstack([placed.scale * placed.rotation, placed.translation[:, None]]).round(9).tolist(),

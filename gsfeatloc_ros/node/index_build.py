@@ -63,7 +63,7 @@ class IndexBuild:
 
         try:
             with self._cores.in_background():
-                key = index_key(engine.map_path, settings.map, settings.matcher)
+                key = index_key(engine.map_path, settings.map, settings.matcher, settings.index)
                 index = index_for(engine, settings.index, key, progress, cancelled.is_set)
         except Exception as error:  # whatever it is, the node serves on
             if not cancelled.is_set():

@@ -57,7 +57,8 @@ class Publishers:
         silent: whether no transform is to be broadcast: nobody knows where the robot is, or the map's scale is wrong.
 
     Raises:
-        ValueError: a transform is to be broadcast, but tf is not installed, or nobody said that the map is aligned.
+        ValueError: a transform is to be broadcast, but tf is not installed, or nobody said that the map is aligned, and
+            it has to be.
     """
 
     def __init__(self, node: Node, settings: Settings, transforms: Transforms, silent: Callable[[], bool]) -> None:
@@ -70,16 +71,7 @@ class Publishers:
         self._broadcast_lock = Lock()
         # Of the image last answered, in nanoseconds.
         self.last_stamp: int | None = None
-        if self._frames.odom and not settings.map.aligned:
-            raise ValueError(
-                "publish_tf needs map.aligned: set it to true once map.scale, map.translation and map.rotation put the "
-                "map where the robot's map frame is; other nodes would believe a pose that is off"
-            )
-        if settings.recovery.planar and not settings.map.aligned:
-            raise ValueError(
-                "search.planar needs map.aligned: set it to true once map.scale, map.translation and map.rotation put "
-                "the map where the floor is z = 0"
-            )
+        settings.check_alignment()
         if self._frames.odom or self._frames.body or settings.recovery.planar:
             transforms.listen()
         self._pose = node.create_publisher(

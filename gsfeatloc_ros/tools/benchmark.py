@@ -9,6 +9,7 @@
     gsfeatloc benchmark scaling --out scaling.png
     gsfeatloc benchmark index --out index.png
     gsfeatloc benchmark twins --share 0,0.02 --photos 200
+    gsfeatloc benchmark planar --views 12,24,48
     gsfeatloc benchmark building --rooms 2,10,40,100 --folder /tmp
     gsfeatloc benchmark pnp
 
@@ -28,6 +29,7 @@ from gsfeatloc_ros.benchmark import index_scaling
 from gsfeatloc_ros.benchmark.building import measure_buildings
 from gsfeatloc_ros.benchmark.frames import measure_map, measure_scene, pinhole, print_frames, view_of_all
 from gsfeatloc_ros.benchmark.measure import machine
+from gsfeatloc_ros.benchmark.planar import measure_planar
 from gsfeatloc_ros.benchmark.pnp import measure_pnp
 from gsfeatloc_ros.benchmark.query import measure_queries, print_queries
 from gsfeatloc_ros.benchmark.scaling import COUNTS, draw_scaling, measure_scaling
@@ -166,10 +168,18 @@ def make_parser() -> argparse.ArgumentParser:
     )
     twins.set_defaults(run=_twins)
 
+    planar = commands.add_parser(
+        "planar", parents=[file], help="photos of a robot on the floor, by views anywhere and by views on its plane"
+    )
+    planar.add_argument("--views", type=_counts, default=[12, 24, 48], metavar="LIST", help="(default: 12,24,48)")
+    planar.add_argument("--photos", type=number(int, 1), default=40, help="(default: %(default)s)")
+    planar.add_argument("--seed", type=int, default=0, help="another one gives another room, photos and indices")
+    planar.set_defaults(run=_planar)
+
     building = commands.add_parser("building", parents=[file], help="memory, starts, frames, queries of large maps")
     building.add_argument(
         "--rooms",
-        type=lambda text: [number(int, 1)(part) for part in text.split(",")],
+        type=_counts,
         default=[2, 10, 40, 100],
         metavar="LIST",
         help="of the buildings, of 500,000 Gaussians each (default: 2,10,40,100)",
@@ -260,6 +270,10 @@ def _twins(options: argparse.Namespace) -> None:
     _write(options.json, {"rows": rows})
 
 
+def _planar(options: argparse.Namespace) -> None:
+    _write(options.json, {"rows": measure_planar(options.views, options.photos, options.seed)})
+
+
 def _building(options: argparse.Namespace) -> None:
     rows = measure_buildings(options.rooms, options.folder, options.sh_degree)
     _write(options.json, {"rows": rows})
@@ -268,6 +282,10 @@ def _building(options: argparse.Namespace) -> None:
 def _write(path: Path | None, report: dict[str, Any]) -> None:
     if path:
         path.write_text(json.dumps({"machine": machine()} | report, indent=1) + "\n")
+
+
+def _counts(text: str) -> list[float]:
+    return [number(int, 1)(part) for part in text.split(",")]
 
 
 def _shares(text: str) -> list[float]:

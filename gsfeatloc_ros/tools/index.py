@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
+from gsfeatloc_ros.common.parameter import Parameter, parameters_of
 from gsfeatloc_ros.evaluate.scene import load_poses
 from gsfeatloc_ros.index import IndexOptions, ViewIndex, build_index
 from gsfeatloc_ros.index.storage import index_path, save_index
@@ -26,7 +27,7 @@ from gsfeatloc_ros.localize.settings import MatcherSettings, RendererSettings
 from gsfeatloc_ros.maps import Similarity
 from gsfeatloc_ros.match import MATCHERS
 from gsfeatloc_ros.render import DEVICES, Renderer
-from gsfeatloc_ros.tools.options import add_map_options, check_outputs, map_settings, number, print_reading
+from gsfeatloc_ros.tools.options import add_map_options, check_outputs, map_settings, number, print_reading, value_of
 from gsfeatloc_ros.tools.status import run_tool
 
 
@@ -51,7 +52,7 @@ def _make(options: argparse.Namespace) -> tuple[Path, ViewIndex]:
     """Make the index that the options ask for, and write it; return where it is."""
     check_outputs(options.out)
     map_ = map_settings(options).resolved()
-    key = index_key(map_.path, map_, matcher_settings(options))
+    key = index_key(map_.path, map_, matcher_settings(options), index_settings(options))
     path = options.out or index_path(map_.path)
     poses = training_poses(options, map_.alignment())
     renderer = load_renderer(map_, RendererSettings(options.device, options.threads))
@@ -64,6 +65,11 @@ def _make(options: argparse.Namespace) -> tuple[Path, ViewIndex]:
 def matcher_settings(options: argparse.Namespace) -> MatcherSettings:
     """Return the features that options of `add_index_options` name."""
     return MatcherSettings(options.matcher, options.weights)
+
+
+def index_settings(options: argparse.Namespace) -> IndexOptions:
+    """Return how options of `add_index_options` say that an index is made."""
+    return IndexOptions(**{option.name: getattr(options, option.name) for option in _options()})
 
 
 def training_poses(options: argparse.Namespace, placed: Similarity) -> np.ndarray | None:
@@ -87,8 +93,7 @@ def make_index(options: argparse.Namespace, renderer: Renderer, poses: np.ndarra
             bar.total = total
             bar.update(done - bar.n)
 
-        settings = IndexOptions(views=options.views, seed=options.seed)
-        return build_index(renderer, features, settings, progress, poses=poses)
+        return build_index(renderer, features, index_settings(options), progress, poses=poses)
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -105,7 +110,7 @@ def make_parser() -> argparse.ArgumentParser:
 
 def add_index_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of how an index is made, for `make_index`."""
-    index, matcher = IndexOptions(), MatcherSettings()
+    matcher = MatcherSettings()
     parser.add_argument(
         "--poses",
         type=Path,
@@ -113,16 +118,23 @@ def add_index_options(parser: argparse.ArgumentParser) -> None:
         help="poses that the map's photos were taken at, in the frame of its file, which are chosen from first: the "
         "folder of a scene, as for evaluate, or a transforms.json",
     )
-    parser.add_argument(
-        "--views", type=number(int, 1), default=index.views, metavar="N", help="their number (default: %(default)s)"
-    )
-    parser.add_argument(
-        "--seed", type=number(int, 0), default=index.seed, metavar="S", help="another one gives other views"
-    )
+    for option in _options():
+        parser.add_argument(
+            "--" + option.name.replace("_", "-"),
+            type=value_of(option),
+            default=option.default,
+            metavar=option.name.rpartition("_")[2].upper(),
+            help=f"{option.description} (default: %(default)s)",
+        )
     parser.add_argument("--matcher", choices=sorted(MATCHERS), default=matcher.name, help="default: %(default)s")
     parser.add_argument("--weights", default="", metavar="PATH", help="of a learned matcher, as matcher.weights")
     parser.add_argument("--device", choices=DEVICES, default="auto", help="to render on (default: %(default)s)")
     parser.add_argument("--threads", type=number(int, 0), default=0, help="CPU threads; 0 for one per core")
+
+
+def _options() -> list[Parameter]:
+    """Return the node's parameters index.* that are about how an index is made: not whether, nor where it is kept."""
+    return [option for option in parameters_of(IndexOptions) if option.name not in ("build", "path")]
 
 
 if __name__ == "__main__":

@@ -81,12 +81,12 @@ def setting(parse: Callable[[Callable[[str], float]], Callable[[str], Any]]) -> 
             raise argparse.ArgumentTypeError(f"{name} is no option any more: use {_RETIRED[name]}")
         if not equals or name not in options:
             raise argparse.ArgumentTypeError(f"{text} is not OPTION=VALUE with an option out of {', '.join(options)}")
-        return name, parse(_value_of(options[name]))(value)
+        return name, parse(value_of(options[name]))(value)
 
     return parse_setting
 
 
-def _value_of(parameter: Parameter) -> Callable[[str], float]:
+def value_of(parameter: Parameter) -> Callable[[str], float]:
     """Make the parser of a number that a parameter takes."""
 
     def parse(text: str) -> float:

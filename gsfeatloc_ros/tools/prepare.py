@@ -38,7 +38,13 @@ from gsfeatloc_ros.maps.files import content_of, find_map, map_files
 from gsfeatloc_ros.render.cache import SUFFIX
 from gsfeatloc_ros.ros_io.parameter_file import read_parameter_file
 from gsfeatloc_ros.ros_io.settings import Settings
-from gsfeatloc_ros.tools.index import add_index_options, make_index, matcher_settings, training_poses
+from gsfeatloc_ros.tools.index import (
+    add_index_options,
+    index_settings,
+    make_index,
+    matcher_settings,
+    training_poses,
+)
 from gsfeatloc_ros.tools.options import add_map_options, given_map, print_reading
 from gsfeatloc_ros.tools.status import run_tool
 
@@ -66,7 +72,10 @@ def _prepare(options: argparse.Namespace) -> int:
     map_ = replace(MapSettings(str(bundle.folder)).resolved(), cache=True)
     renderer = load_renderer(map_, RendererSettings(options.device, options.threads))
     print_reading("prepare", renderer)
-    index_file, key = index_path(map_.path), index_key(map_.path, map_, matcher_settings(options))
+    index_file, key = (
+        index_path(map_.path),
+        index_key(map_.path, map_, matcher_settings(options), index_settings(options)),
+    )
     index = load_or_make(index_file, key, lambda: make_index(options, renderer, poses))
     derived = [bundle.map.with_name(bundle.map.name + SUFFIX), index_file]
     if not options.skip_inspection:

@@ -167,7 +167,7 @@ def _engine(settings: Settings) -> Engine:
     """Load what localizes, and the index of the map's views."""
     engine = load_engine(settings.map, settings.matcher, settings.renderer, settings.localizer)
     print_reading("replay", engine.renderer)
-    key = index_key(engine.map_path, settings.map, settings.matcher)
+    key = index_key(engine.map_path, settings.map, settings.matcher, settings.index)
     return engine.with_index(index_for(engine, settings.index, key))
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from gsfeatloc_ros.index import IndexOptions
 from gsfeatloc_ros.index.placement import radius
 from gsfeatloc_ros.index.storage import index_path, load_index
 from gsfeatloc_ros.inspect.looks import look_around
@@ -130,7 +131,7 @@ class Page:
 def _index_poses(map_: MapSettings) -> list[np.ndarray]:
     """Return the poses of the index of a map, if there is one that can be read."""
     try:
-        path, key = index_path(map_.path), index_key(map_.path, map_, MatcherSettings())
+        path, key = index_path(map_.path), index_key(map_.path, map_, MatcherSettings(), IndexOptions())
         # Whatever features it has, where it looks from is the same.
         found = (load_index(path, key | {"matcher": [name, ""]}) for name in MATCHERS)
         index = next((index for index in found if index is not None), None)

@@ -145,6 +145,7 @@ def test_of_a_planar_robot_only_x_y_and_yaw_are_unknown(tf, room_map_file, room_
 
 def test_a_map_that_nobody_aligned_has_no_floor(room_map_file):
     assert_start_fails("search.planar needs map.aligned", map__path=room_map_file, search__planar=True)
+    assert_start_fails("index.camera_height needs map.aligned", map__path=room_map_file, index__camera_height=0.4)
 
 
 def test_initialpose_as_rviz_sends_it(tf, room_map_file, room_camera, photo, T_map_base):

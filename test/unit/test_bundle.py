@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from gsfeatloc_ros.align.alignment import write_parameters
+from gsfeatloc_ros.index import IndexOptions
 from gsfeatloc_ros.index.storage import index_path, load_index
 from gsfeatloc_ros.localize.map_index import index_key
 from gsfeatloc_ros.localize.settings import MapSettings, MatcherSettings
@@ -55,7 +56,7 @@ def test_a_copy_has_all_that_a_robot_needs(bundle, room_map_file) -> None:
     map_ = MapSettings(str(bundle)).resolved()
     assert (map_.aligned, map_.scale) == (True, 2.0)
     assert (map_.translation, map_.rotation) == (PLACED.translation, PLACED.rotation)
-    index = load_index(index_path(bundle), index_key(str(bundle), map_, MatcherSettings()))
+    index = load_index(index_path(bundle), index_key(str(bundle), map_, MatcherSettings(), IndexOptions()))
     assert index is not None
     assert len(index) > 0
     assert "scale: 2.000 +- 0.001" in (bundle / "alignment.yaml").read_text()

@@ -152,7 +152,7 @@ def engine(map_path, renderer, matcher) -> Engine:
 
 @pytest.fixture
 def key(map_path):
-    return index_key(str(map_path), MapSettings(), MatcherSettings())
+    return index_key(str(map_path), MapSettings(), MatcherSettings(), IndexOptions())
 
 
 def refuse(*arguments) -> None:
@@ -204,10 +204,10 @@ def test_the_index_of_another_map_place_or_matcher_is_made_anew(engine, map_path
     other.write_bytes(map_path.read_bytes()[:-1])
     keys = [
         key,
-        index_key(str(other), MapSettings(), MatcherSettings()),
-        index_key(str(map_path), MapSettings(scale=2.0), MatcherSettings()),
-        index_key(str(map_path), MapSettings(translation=(1.0, 0.0, 0.0)), MatcherSettings()),
-        index_key(str(map_path), MapSettings(), MatcherSettings(name="xfeat")),
+        index_key(str(other), MapSettings(), MatcherSettings(), IndexOptions()),
+        index_key(str(map_path), MapSettings(scale=2.0), MatcherSettings(), IndexOptions()),
+        index_key(str(map_path), MapSettings(translation=(1.0, 0.0, 0.0)), MatcherSettings(), IndexOptions()),
+        index_key(str(map_path), MapSettings(), MatcherSettings(name="xfeat"), IndexOptions()),
     ]
     assert index_for(engine, FEW, key) is not None
     for number, wanted in enumerate(keys):
@@ -218,4 +218,4 @@ def test_the_index_of_another_map_place_or_matcher_is_made_anew(engine, map_path
 def test_a_copy_of_the_map_has_the_same_index(map_path, key, tmp_path) -> None:
     copy = tmp_path / "copy.ply"
     copy.write_bytes(map_path.read_bytes())
-    assert index_key(str(copy), MapSettings(path=str(copy)), MatcherSettings()) == key
+    assert index_key(str(copy), MapSettings(path=str(copy)), MatcherSettings(), IndexOptions()) == key

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 from room_datasets import OPENGL, write_nerfstudio
 
 from gsfeatloc_ros.common.geometry import matrix_from_quaternion
+from gsfeatloc_ros.index import IndexOptions
 from gsfeatloc_ros.index.storage import index_path, load_index
 from gsfeatloc_ros.localize.map_index import index_key
 from gsfeatloc_ros.localize.settings import MapSettings, MatcherSettings
@@ -30,7 +32,7 @@ def map_path(tmp_path, room_map_file) -> Path:
 
 
 def key_of(path: Path, **settings):
-    return index_key(str(path), MapSettings(**settings), MatcherSettings())
+    return index_key(str(path), MapSettings(**settings), MatcherSettings(), IndexOptions())
 
 
 def test_the_index_lies_where_the_node_looks_for_it_and_is_what_it_expects(map_path, capsys) -> None:
@@ -55,6 +57,19 @@ def test_another_seed_gives_another_index_where_it_was_asked_for(map_path, tmp_p
     assert other is not None
     assert not np.array_equal(one.poses, other.poses)
     assert not index_path(map_path).exists()
+
+
+def test_views_are_placed_where_the_camera_of_a_robot_on_the_floor_is(map_path) -> None:
+    plane = ["--camera-height", "0.4", "--camera-pitch", "-10"]
+    assert index.main([str(map_path), *FEW, *plane]) == 0
+    key = partial(index_key, str(map_path), MapSettings(), MatcherSettings())
+    made = load_index(index_path(map_path), key(IndexOptions(camera_height=0.4, camera_pitch=-10.0)))
+    assert made is not None
+    np.testing.assert_allclose(made.poses[:, 2, 3], 0.4)
+    np.testing.assert_allclose(made.poses[:, 2, 2], np.sin(np.radians(-10)), atol=1e-9)
+    # Who does not say where views have to be takes these; who does takes no others.
+    assert load_index(index_path(map_path), key(IndexOptions())) is not None
+    assert load_index(index_path(map_path), key(IndexOptions(camera_height=0.5, camera_pitch=-10.0))) is None
 
 
 @pytest.mark.parametrize("kind", ["scene", "transforms.json"])
@@ -87,6 +102,7 @@ def test_training_poses_are_used_in_the_robots_frame(kind, map_path, tmp_path, r
         (["room.ply", "--poses", "nowhere"], "holds none of transforms.json"),
         (["room.ply", "--poses", "room.ply"], "room.ply"),
         (["room.ply", "--poses", "empty.json"], "frames is empty"),
+        (["room.ply", "--camera-height", "900"], "nothing of the map is seen from 900 above its plane z = 0"),
         (["room.ply", "--out", "."], "cannot be written"),
         (["room.ply", "--out", "/proc/nowhere/room.index"], "cannot be written"),
         (["room.ply", "--map-scale", "-1"], "scale -1"),

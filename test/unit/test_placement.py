@@ -13,10 +13,12 @@ from hypothesis.extra.numpy import arrays
 from small_maps import small_camera
 
 from gsfeatloc_ros.common.geometry import make_pose, so3_exp, transform
+from gsfeatloc_ros.index.options import IndexOptions
 from gsfeatloc_ros.index.placement import cells, cover, overlap, radius, random_poses, seen_cells, sees
 from gsfeatloc_ros.render import Render
 
 POSE = make_pose(so3_exp(np.array([0.3, -0.2, 1.0])), np.array([1.0, 2.0, 3.0]))
+ANYWHERE = IndexOptions()
 CLOUD = np.random.default_rng(0).uniform([-3, -2, 0], [3, 2, 1], (500, 3))
 
 
@@ -64,18 +66,31 @@ def test_nothing_is_chosen_of_nothing() -> None:
 @given(seed=st.integers(0, 2**32 - 1), shift=st.floats(-1e3, 1e3), scale=st.floats(1e-3, 1e3))
 def test_random_poses_aim_at_a_point(seed: int, shift: float, scale: float) -> None:
     points = shift + scale * CLOUD
-    for pose, distance in zip(*random_poses(points, 20, np.random.default_rng(seed)), strict=True):
+    for pose, target in zip(*random_poses(points, 20, np.random.default_rng(seed), ANYWHERE), strict=True):
         np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-9)
         assert np.linalg.det(pose[:3, :3]) > 0
-        seen = (points - pose[:3, 3]) @ pose[:3, :3]
-        off_axis = np.linalg.norm(seen[:, :2], axis=1)
-        aimed_at = (off_axis < 1e-6 * (abs(shift) + scale)) & np.isclose(seen[:, 2], distance)
-        assert aimed_at.any()
+        assert (points == target).all(axis=1).any()
+        x, y, z = pose[:3, :3].T @ (target - pose[:3, 3])
+        assert np.hypot(x, y) < 1e-6 * (abs(shift) + scale)
+        assert z > 0
+
+
+@given(height=st.floats(0.01, 5.0), pitch=st.floats(-90.0, 90.0))
+def test_a_robot_on_the_plane_looks_from_its_camera_and_faces_what_it_looks_at(height: float, pitch: float) -> None:
+    options = IndexOptions(camera_height=height, camera_pitch=pitch)
+    poses, targets = random_poses(CLOUD, 20, np.random.default_rng(0), options)
+    np.testing.assert_allclose(poses[:, 2, 3], height)
+    np.testing.assert_allclose(poses[:, 2, 2], np.sin(np.radians(pitch)), atol=1e-9)
+    for pose, target in zip(poses, targets, strict=True):
+        to_target, ahead = (target - pose[:3, 3])[:2], pose[:2, 2]
+        assert to_target @ ahead >= 0
+        # In the vertical plane through the camera's axis, however near that is to the vertical itself.
+        assert abs(to_target[0] * ahead[1] - to_target[1] * ahead[0]) < 1e-9
 
 
 def test_random_poses_are_nearly_upright() -> None:
     """But for those that look up or down."""
-    poses, _ = random_poses(CLOUD, 400, np.random.default_rng(0))
+    poses, _ = random_poses(CLOUD, 400, np.random.default_rng(0), ANYWHERE)
     level = poses[np.abs(poses[:, 2, 2]) < 0.7]
     assert len(level) > 100
     assert (level[:, 2, 1] < -0.5).all()  # what is down in the picture
@@ -83,7 +98,7 @@ def test_random_poses_are_nearly_upright() -> None:
 
 
 def test_random_poses_lie_inside_and_around() -> None:
-    positions = random_poses(CLOUD, 400, np.random.default_rng(0))[0][:, :3, 3]
+    positions = random_poses(CLOUD, 400, np.random.default_rng(0), ANYWHERE)[0][:, :3, 3]
     inside = ((positions > CLOUD.min(axis=0)) & (positions < CLOUD.max(axis=0))).all(axis=1)
     assert 0.2 < inside.mean() < 0.8
     distances = np.linalg.norm(positions[:, None] - CLOUD, axis=2).min(axis=1)
@@ -91,20 +106,20 @@ def test_random_poses_lie_inside_and_around() -> None:
 
 
 def test_the_same_seed_gives_the_same_poses() -> None:
-    a, b, c = (random_poses(CLOUD, 10, np.random.default_rng(seed))[0] for seed in (1, 1, 2))
+    a, b, c = (random_poses(CLOUD, 10, np.random.default_rng(seed), ANYWHERE)[0] for seed in (1, 1, 2))
     np.testing.assert_array_equal(a, b)
     assert not np.allclose(a, c)
 
 
 def test_a_single_point_is_looked_at() -> None:
-    poses, _ = random_poses(np.ones((1, 3)), 5, np.random.default_rng(0))
+    poses, _ = random_poses(np.ones((1, 3)), 5, np.random.default_rng(0), ANYWHERE)
     assert poses.shape == (5, 4, 4)
     assert np.isfinite(poses).all()
 
 
 def test_nothing_solid_cannot_be_looked_at() -> None:
     with pytest.raises(ValueError, match="nothing in the map is solid"):
-        random_poses(np.empty((0, 3)), 5, np.random.default_rng(0))
+        random_poses(np.empty((0, 3)), 5, np.random.default_rng(0), ANYWHERE)
 
 
 def test_a_few_outliers_do_not_make_a_map_larger() -> None:
@@ -151,8 +166,22 @@ def test_a_view_of_nothing_distinct_shows_nothing(render: Render) -> None:
     assert seen_cells(render, small_camera(), POSE, near=0.1) == set()
 
 
-def test_what_is_aimed_at_is_seen_unless_something_is_before_it() -> None:
-    assert sees(wall(2.0), 2.1)
-    assert not sees(wall(2.0), 4.0)
-    assert not sees(wall(4.0), 2.0)
-    assert not sees(wall(np.nan), 2.0)
+@pytest.mark.parametrize("pixel", [(7.5, 5.5), (2.0, 9.0)], ids=["ahead", "aside"])
+def test_what_is_aimed_at_is_seen_unless_something_is_before_it(pixel) -> None:
+    camera = small_camera(16, 12)
+
+    def seen(depth: float, distance: float) -> bool:
+        target = transform(POSE, distance * camera.rays(np.array([pixel])))[0]
+        return sees(wall(depth), camera, POSE, target)
+
+    assert seen(2.0, 2.1)
+    assert not seen(2.0, 4.0)
+    assert not seen(4.0, 2.0)
+    assert not seen(np.nan, 2.0)
+    assert not seen(2.0, -2.0)
+
+
+def test_what_is_beside_the_picture_is_not_seen() -> None:
+    camera = small_camera(16, 12)
+    target = transform(POSE, 2.0 * camera.rays(np.array([[20.0, 5.0]])))[0]
+    assert not sees(wall(2.0), camera, POSE, target)
