@@ -19,10 +19,16 @@ POSE = make_pose(so3_exp(np.array([0.4, -1.1, 0.3])), np.array([2.0, -1.0, 0.5])
 ROLLING = np.array([0.004, -0.012, 0.006])
 
 
-def seen(camera: Camera, k1: float = 0.0, rolling: np.ndarray | None = None, seed: int = 0) -> Correspondences:
+def seen(
+    camera: Camera,
+    k1: float = 0.0,
+    rolling: np.ndarray | None = None,
+    depths: tuple[float, float] = (2, 8),
+    seed: int = 0,
+) -> Correspondences:
     """What a camera at POSE sees of random points, rows one after another where it is turned by `rolling` meanwhile."""
     rng = np.random.default_rng(seed)
-    points = transform(POSE, CAMERA.rays(rng.uniform([0, 0], [639, 479], (600, 2))) * rng.uniform(2, 8, (600, 1)))
+    points = transform(POSE, CAMERA.rays(rng.uniform([0, 0], [639, 479], (600, 2))) * rng.uniform(*depths, (600, 1)))
     pixels = np.full((600, 2), 240.0)
     for _ in range(1 if rolling is None else 5):  # the row at which a point is read depends on where it is seen
         when = (pixels[:, 1:] + 0.5) / camera.height - 0.5
@@ -84,14 +90,23 @@ def off(answer: CameraFit | PoseSolution) -> float:
     ("error", "k1", "turn"), [(0.0, 0.0, 0.0), (0.002, 0.0, 0.0), (0.0, -0.01, 0.0), (0.0, 0.0, 1)]
 )
 def test_the_covariance_allows_for_what_a_calibration_in_use_is_off_by(error: float, k1: float, turn: float) -> None:
-    squares = []
-    for seed in range(20):
-        found = seen(longer(error), k1=k1, rolling=0.2 * turn * ROLLING, seed=seed)
-        fit, _ = fitted(found)
-        rotation = so3_log(POSE[:3, :3] @ fit.T_map_camera[:3, :3].T)
-        deviation = np.concatenate([POSE[:3, 3] - fit.T_map_camera[:3, 3], rotation])
-        squares.append(deviation @ np.linalg.solve(fit.covariance, deviation) / 6)
+    squares = [nees(seen(longer(error), k1=k1, rolling=0.2 * turn * ROLLING, seed=seed)) for seed in range(20)]
     assert np.mean(squares) < 1.2
+
+
+@pytest.mark.parametrize("error", [-0.03, 0.0, 0.02])
+def test_the_covariance_allows_for_a_focal_length_that_reads_as_off(error: float) -> None:
+    """A shallow scene hardly shows it, and it moves the pose."""
+    squares = [nees(seen(longer(error), depths=(4, 4.5), seed=seed)) for seed in range(20)]
+    assert np.mean(squares) < 1.2
+
+
+def nees(found: Correspondences) -> float:
+    """The normalised squared error of the fit, per degree of freedom."""
+    fit, _ = fitted(found)
+    rotation = so3_log(POSE[:3, :3] @ fit.T_map_camera[:3, :3].T)
+    deviation = np.concatenate([POSE[:3, 3] - fit.T_map_camera[:3, 3], rotation])
+    return float(deviation @ np.linalg.solve(fit.covariance, deviation) / 6)
 
 
 def test_what_is_behind_the_camera_is_infinitely_far_off() -> None:
