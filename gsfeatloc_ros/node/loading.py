@@ -15,7 +15,6 @@ Result = TypeVar("Result")
 LOAD_TIMEOUT = 900.0
 # Seconds between two looks whether to go on.
 _PERIOD = 0.1
-_THREAD = "loader"
 
 
 class GivenUpError(RuntimeError):
@@ -42,7 +41,7 @@ def load(work: Callable[[], Result], go_on: Callable[[], bool], timeout: float =
             done.set_exception(error)
 
     # A daemon: what hangs must not keep the process alive.
-    threading.Thread(target=run, name=_THREAD, daemon=True).start()
+    threading.Thread(target=run, name="loader", daemon=True).start()
     deadline = time.monotonic() + timeout
     while not wait([done], _PERIOD).done:
         if not go_on():
@@ -50,8 +49,3 @@ def load(work: Callable[[], Result], go_on: Callable[[], bool], timeout: float =
         if time.monotonic() > deadline:
             raise GivenUpError(f"loading took longer than {timeout:g} s: does its disk, or a pipe, hang?")
     return done.result()
-
-
-def is_loading() -> bool:
-    """Return whether anything is still loaded, though nobody may wait for it any more."""
-    return any(thread.name == _THREAD for thread in threading.enumerate())

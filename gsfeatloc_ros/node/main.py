@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import sys
 import time
 from typing import TYPE_CHECKING
@@ -9,7 +10,6 @@ from typing import TYPE_CHECKING
 from gsfeatloc_ros.common.threads import wait_passively
 from gsfeatloc_ros.common.words import in_one_line
 from gsfeatloc_ros.node.environment import check_environment
-from gsfeatloc_ros.node.loading import is_loading
 from gsfeatloc_ros.node.stop import Stop, leave
 from gsfeatloc_ros.node.systemd import Systemd
 
@@ -25,9 +25,9 @@ _PERIOD = 0.1
 
 
 def main(args: list[str] | None = None) -> int:
-    """Run the node until SIGINT, SIGTERM or a transition to `finalized`; return the exit status.
+    """Run the node until SIGINT, SIGTERM or a transition to `finalized`, and end the process with status 0.
 
-    It is 0 if the node was asked to end, and 1 if it could not start or go on: then the last line says why.
+    Where it cannot start, return 1; where it cannot go on, end the process with that. The last line says why.
     """
     # Before the imports below: they load OpenMP.
     wait_passively()
@@ -74,7 +74,9 @@ def main(args: list[str] | None = None) -> int:
         leave(1)
     systemd.stopping()
     _end(node, executor)
-    return 0
+    # The interpreter's own end takes back what was compiled in this run, for seconds, and pulls what still loads away.
+    atexit._run_exitfuncs()
+    leave(0)
 
 
 def _end(node: LocalizerNode, executor: GuardedExecutor) -> None:
@@ -91,8 +93,6 @@ def _end(node: LocalizerNode, executor: GuardedExecutor) -> None:
         executor.spin_once(_PERIOD)
     node.destroy_node()
     rclpy.shutdown()
-    if is_loading():
-        leave(0)
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ import socket
 import sys
 import threading
 from types import FrameType
+from typing import NoReturn
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 # Seconds after which a process that was to end and still has not is ended by force.
@@ -55,7 +56,7 @@ class Stop:
         faulthandler.dump_traceback_later(_TIMEOUT, exit=True)
 
 
-def leave(status: int) -> None:
+def leave(status: int) -> NoReturn:
     """End the process at once: threads may be in native code that the interpreter's own exit would pull away."""
     sys.stdout.flush()
     sys.stderr.flush()

@@ -14,12 +14,14 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
-from node_harness import TIMEOUT, NodeProcess, connected_client, node_arguments
+from node_harness import RESEND_PERIOD, TIMEOUT, NodeProcess, connected_client, node_arguments
 
 from gsfeatloc_ros.client.messages import camera_info_of, pose_with_covariance
 
 # Seconds of silence after which systemd would end it; a slow machine may hold it up for some.
 WATCHDOG = 8.0
+# Seconds between two beats are a quarter of that: here one was left out.
+SILENCE = 3.0
 
 
 class Listener:
@@ -102,7 +104,7 @@ def test_a_start_that_fails_is_never_ready(tmp_path):
 IMPATIENT = """
 import sys
 from gsfeatloc_ros.node import localizer_node, main
-localizer_node._MAX_BUSY = 1.0
+localizer_node._MAX_BUSY = 0.2
 sys.exit(main.main())
 """
 
@@ -119,9 +121,12 @@ def test_of_a_localization_that_does_not_end_no_beat_tells(room_map_file, room_c
                 client.send_camera_info(camera_info_of(room_camera))
                 wide = pose_with_covariance(photo.T_map_camera, np.diag([1.0, 1.0, 1.0, 10.0, 10.0, 10.0]))
                 client.send_prior(wide)
-                client.send_once(np.ascontiguousarray(photo.image[:, ::-1]))
-                assert client.spin_until(lambda: systemd.silence() > WATCHDOG / 2, TIMEOUT)
-                assert not client.diagnostics[-1:] or client.diagnostics[-1].values["status"] == "ready"
+                # Best effort may lose an image.
+                for _ in range(10):
+                    client.send_once(np.ascontiguousarray(photo.image[:, ::-1]))
+                    if client.spin_until(lambda: systemd.silence() > SILENCE, 2 * RESEND_PERIOD):
+                        break
+                assert systemd.silence() > SILENCE
         finally:
             process.send_signal(signal.SIGTERM)
             assert process.wait(TIMEOUT) == 0
