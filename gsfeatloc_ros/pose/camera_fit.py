@@ -102,8 +102,8 @@ def _fit(camera: Camera, calibrated: _State, found: Correspondences, options: Po
     sigmas = np.sqrt(np.maximum(np.diag(problem.covariance(system, unbent, _ANY_CAMERA))[6:], 0.0))
     excess = np.sqrt(np.maximum(free.camera**2 - sigmas**2, 0.0))
     kept = problem.solve(system, np.clip(np.where(_CONTRADICTED, excess, 0.0), _EXACT, _ANY_CAMERA))
-    # What a calibration in use, or one whose focal length is as far off as it reads, would move the pose by is not known
-    # better than that.
+    # What a calibration in use, or one whose focal length is as far off as it reads, would move the pose by is not
+    # known better than that.
     off = np.clip(np.where(_CONTRADICTED, 0.0, excess), _CALIBRATED, _ANY_CAMERA)
     system = problem.at(kept)
     shift, field = system.step(off)[:6], problem.field(system)

@@ -173,7 +173,9 @@ def make_parser() -> argparse.ArgumentParser:
     )
     planar.add_argument("--views", type=_counts, default=[12, 24, 48], metavar="LIST", help="(default: 12,24,48)")
     planar.add_argument("--photos", type=number(int, 1), default=40, help="(default: %(default)s)")
-    planar.add_argument("--seed", type=int, default=0, help="another one gives another room, photos and indices")
+    planar.add_argument(
+        "--seed", type=number(int, 0), default=0, help="another one gives another room, photos and indices"
+    )
     planar.set_defaults(run=_planar)
 
     building = commands.add_parser("building", parents=[file], help="memory, starts, frames, queries of large maps")

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import argparse
 import ast
 import functools
+import importlib
 import re
 from pathlib import Path
 from xml.etree import ElementTree
@@ -80,15 +82,23 @@ def test_anchors_are_githubs() -> None:
 
 @each_document
 def test_commands_name_modules_with_the_options_given(document: Path) -> None:
-    shared = (PACKAGE / "tools/options.py").read_text(encoding="utf-8")
     for code in code_of(document):
         for module, rest in re.findall(r"(?:python3? -m (?=gsfeatloc_ros)|gsfeatloc )([\w.]+)([^#;)]*)", code):
             module = module if module.startswith("gsfeatloc_ros") else f"gsfeatloc_ros.tools.{module}"
             source = ROOT / (module.replace(".", "/") + ".py")
             assert source.is_file(), module
-            text = source.read_text(encoding="utf-8") + shared
-            for option in re.findall(r"(?<=\s)--[a-z-]+", rest):
-                assert f'"{option}"' in text, f"{module} {option}"
+            named = set(re.findall(r"(?<=\s)--[a-z-]+", rest))
+            assert not named or named <= options_of(importlib.import_module(module).make_parser()), module
+
+
+def options_of(parser: argparse.ArgumentParser) -> set[str]:
+    """Return the options that a parser takes, those of its subcommands included."""
+    options = set()
+    for action in parser._actions:
+        options |= set(action.option_strings)
+        if isinstance(action, argparse._SubParsersAction):
+            options |= {option for command in action.choices.values() for option in options_of(command)}
+    return options
 
 
 @each_document
