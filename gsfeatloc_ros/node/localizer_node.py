@@ -16,7 +16,7 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from rclpy.parameter import Parameter
 
 from gsfeatloc_ros.common.threads import limit_threads
-from gsfeatloc_ros.common.words import in_one_line
+from gsfeatloc_ros.common.words import in_one_line, shortened
 from gsfeatloc_ros.localize.engine import load_engine
 from gsfeatloc_ros.node.diagnostics import Reporter
 from gsfeatloc_ros.node.loading import load
@@ -187,10 +187,12 @@ class LocalizerNode(LifecycleNode):
         return self._session
 
     def _on_change_state(self, request: ChangeState.Request, response: ChangeState.Response) -> ChangeState.Response:
+        # rcl logs it.
+        request.transition.label = shortened(request.transition.label)
         try:
             return self._change_state(request, response)
         except rclpy_implementation.RCLError as error:
-            self.get_logger().warning(f"transition {request.transition.id} is not taken: {error}")
+            self._reporter.warn("transition", f"transition {request.transition.id} is not taken: {error}")
             response.success = False
             return response
 

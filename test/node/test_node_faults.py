@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from lifecycle_msgs.srv import ChangeState
 from node_harness import Client, assert_answer, assert_no_answer, connected_client, running_localizer
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
@@ -192,6 +193,9 @@ def test_texts_from_outside_are_cut(client, localizer, good_info, good_prior, ph
     answer = client.relocalize()
     assert not answer.success
     assert len(answer.message) < 1100
+    request = ChangeState.Request()
+    request.transition.label = 1_000_000 * "x"
+    assert not client.call(ChangeState, "localizer/change_state", request).success
     assert len(localizer.output) - before < 10_000
     client.send_prior(good_prior)
     assert_answer(client, photo)
