@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from gsfeatloc_ros.client.live import LiveNode
 
 _LOOPBACK = "127.0.0.1"
+_MAX_PORT = 65535
 # Browsers draw so many well; each takes 32 bytes on the way there.
 _GAUSSIANS = 500_000
 # Seconds between two looks at what came.
@@ -58,8 +59,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _view(options: argparse.Namespace) -> int:
     import_extra("viser")
     from gsfeatloc_ros.view.page import Page, PageOptions
-    from gsfeatloc_ros.view.server import PageServer
+    from gsfeatloc_ros.view.server import PageServer, check_host
 
+    check_host(options.host)
     check_outputs(options.out)
     store, map_ = Store(), _map(options)
     if options.answers:
@@ -135,7 +137,7 @@ def make_parser() -> argparse.ArgumentParser:
         metavar="N",
         help="drawn at most, of more a sample, larger (default: %(default)s)",
     )
-    parser.add_argument("--port", type=number(int, 0), default=8080, help="or the next free one (default: %(default)s)")
+    parser.add_argument("--port", type=_port, default=8080, help="or the next free one (default: %(default)s)")
     parser.add_argument(
         "--host", default=_LOOPBACK, help="address to listen on; there is no password (default: %(default)s)"
     )
@@ -146,6 +148,13 @@ def make_parser() -> argparse.ArgumentParser:
         "--ros-args", nargs=argparse.REMAINDER, default=[], help="of --live, at the end: remappings, as -r pose:=/there"
     )
     return parser
+
+
+def _port(text: str) -> int:
+    port = int(number(int, 0)(text))
+    if port > _MAX_PORT:
+        raise argparse.ArgumentTypeError(f"{port} is no port: they end with {_MAX_PORT}")
+    return port
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import logging
+import socket
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -44,6 +45,16 @@ class PageServer(ViserServer):
         connection: ServerConnection = self._websock_server._live_connections[client.client_id]
         if connection.request is None or not is_own_page(connection.request.headers, self._only_here):
             await connection.close(_POLICY_VIOLATION, "this page is not of this server")
+
+
+def check_host(host: str) -> None:
+    """Raise ValueError where this machine has no such address: viser would say so in a thread, and wait for ever."""
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind, protocol) as probe:
+            probe.bind(address)
+    except OSError as error:
+        raise ValueError(f"{host}: this machine cannot listen there: {error.strerror}") from error
 
 
 def is_own_page(headers: Headers, only_here: bool) -> bool:

@@ -25,3 +25,17 @@ def test_options_that_do_not_go_together_are_refused(map_file, options):
     with pytest.raises(SystemExit) as ended:
         main([map_file, *options])
     assert ended.value.code == 2
+
+
+def test_an_address_that_this_machine_has_not_is_named(tmp_path, capsys):
+    pytest.importorskip("viser")
+    # Of documentation (RFC 5737): nobody has it.
+    assert main([str(tmp_path / "room.ply"), "--host", "192.0.2.1"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("view: 192.0.2.1: this machine cannot listen there: ")
+
+
+def test_a_port_that_is_none_is_named(capsys):
+    with pytest.raises(SystemExit, match="2"):
+        main(["room.ply", "--port", "65536"])
+    assert "argument --port: 65536 is no port" in capsys.readouterr().err
