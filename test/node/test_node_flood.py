@@ -28,8 +28,10 @@ from rclpy.parameter import Parameter
 from std_srvs.srv import Empty, Trigger
 
 from gsfeatloc_ros.client.messages import camera_info_of, pose_stamped, pose_with_covariance, rgb_image
+from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.node.qos import REQUESTS
 from gsfeatloc_ros.ros_io.settings import RequestSettings
+from gsfeatloc_ros.simulate import SimulatedPhoto
 
 COUNT = 500
 # Seconds in which `busy` is told at once, on a slow machine, on which so many requests take a while to be sent.
@@ -81,6 +83,11 @@ def flood(client: Client, kind: type, name: str, request: object, count: int = C
     return answers
 
 
+def localize_image_request(camera: Camera, photo: SimulatedPhoto) -> LocalizeImage.Request:
+    image, prior = rgb_image(photo.image), pose_with_covariance(photo.T_map_camera_prior)
+    return LocalizeImage.Request(image=image, camera_info=camera_info_of(camera), has_prior=True, prior=prior)
+
+
 def test_of_many_who_ask_at_once_few_wait_and_the_others_are_told_at_once(client, photo):
     """They would all share one answer; but whoever can ask can ask for as many as that."""
     answers = flood(client, Trigger, "localizer/relocalize", Trigger.Request())
@@ -100,8 +107,7 @@ def test_of_many_who_ask_at_once_few_wait_and_the_others_are_told_at_once(client
 
 
 def test_images_that_are_sent_at_once_are_localized_or_told_that_it_is_busy(client, room_camera, photo):
-    image, prior = rgb_image(photo.image), pose_with_covariance(photo.T_map_camera_prior)
-    request = LocalizeImage.Request(image=image, camera_info=camera_info_of(room_camera), has_prior=True, prior=prior)
+    request = localize_image_request(room_camera, photo)
     answers = [answer for answer, _ in flood(client, LocalizeImage, "localizer/localize_image", request, 12)]
     localized = [answer for answer in answers if answer.status == LocalizeImage.Response.LOCALIZED]
     busy = [answer for answer in answers if answer.status == LocalizeImage.Response.BUSY]
@@ -109,6 +115,20 @@ def test_images_that_are_sent_at_once_are_localized_or_told_that_it_is_busy(clie
     assert len(localized) > RequestSettings.max_waiting
     for answer in localized:
         assert_close(answer.pose, photo.T_map_camera)
+
+
+def test_what_nobody_waits_for_any_more_is_not_worked_on(client, localizer, room_camera, photo):
+    """Whoever asked has left before its turn."""
+    request = localize_image_request(room_camera, photo)
+    with connected_client() as other:
+        service = other.node.create_client(LocalizeImage, "localizer/localize_image", qos_profile=REQUESTS)
+        assert other.spin_until(service.service_is_ready)
+        settle(other)
+        for _ in range(RequestSettings.max_waiting):
+            service.call_async(request)
+        # Until they have been taken.
+        other.call(GetParameters, "localizer/get_parameters", GetParameters.Request())
+    localizer.wait_for_output("~/localize_image: busy: whoever asked is gone", TIMEOUT)
 
 
 RATE = Parameter("max_rate", value=10.0).to_parameter_msg()
