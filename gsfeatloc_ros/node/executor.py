@@ -108,11 +108,13 @@ class GuardedExecutor(SingleThreadedExecutor):
 
         async def answer(request: Any, header: Any) -> None:
             response = await await_or_execute(service.callback, request, service.srv_type.Response())
-            if isinstance(response, Later):
+            if not isinstance(response, Later):
+                service.send_response(response, header)
+            elif response.done.done():
+                await send(response.make, header)
+            else:
                 task = self._guarded(partial(send, response.make, header))
                 response.done.add_done_callback(lambda _: self.create_task(task))
-            else:
-                service.send_response(response, header)
 
         async def answer_all() -> None:
             for taken in requests:
