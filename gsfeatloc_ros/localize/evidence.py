@@ -150,7 +150,7 @@ class Limits:
     max_focal_error: float = parameter(
         0.05,
         "An image in which a focal length that is off by more than this share would not show is no answer: the pose "
-        "might be off by as much. 1 where camera_info is known to be right.",
+        "might be off by as much. 1 where camera_info is known to be right, as a stream's is once ten answers show it.",
         (0.01, 1.0),
         live=True,
     )

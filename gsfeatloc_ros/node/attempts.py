@@ -237,8 +237,6 @@ class Attempts:
             publishers.candidates(trace.estimate, extrinsics, header) if trace.estimate.candidates else None,
             prior_texts(query),
         )
-        if job.shared:
-            self._outputs.report.camera.take(query.camera, trace.estimate)
         T_map_camera = trace.estimate.T_map_camera
         if job.shared and self.publishing:
             result = self._share(result, query, extrinsics, job.message.header)

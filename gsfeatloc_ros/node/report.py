@@ -138,21 +138,22 @@ class Report:
     Args:
         reporter: that writes it.
         dropped: number of images that gave way to others.
+        camera: what is known of the calibration of the camera on the topic.
         cross_check: of the answers by odometry.
 
     Attributes:
         health: of the session.
-        camera: what is known of the calibration of the camera on the topic.
-        cross_check: see there.
+        camera, cross_check: see there.
         images: number of images that came.
         answers: number of answers that were published.
     """
 
-    def __init__(self, reporter: Reporter, dropped: Callable[[], int], cross_check: CrossCheck) -> None:
-        self._reporter, self.cross_check = reporter, cross_check
+    def __init__(
+        self, reporter: Reporter, dropped: Callable[[], int], camera: CameraHealth, cross_check: CrossCheck
+    ) -> None:
+        self._reporter, self.camera, self.cross_check = reporter, camera, cross_check
         self._dropped = dropped
         self.health = Health()
-        self.camera = CameraHealth()
         self._said = ""
         self.images = 0
         self.answers = 0

@@ -82,7 +82,7 @@ class Session:
         )
         self.inputs, self._follower = inputs, Follower(inputs, state, settings.node.track)
         cross_check = CrossCheck(inputs, settings.crosscheck, settings.map.scale)
-        self.report = Report(reporter, lambda: self.attempts.dropped, cross_check)
+        self.report = Report(reporter, lambda: self.attempts.dropped, self._follower.camera, cross_check)
 
         def withheld() -> str:
             return self.report.wrong_scale if settings.node.publish_tf else ""

@@ -17,6 +17,11 @@ _MAX_READINGS = 1000
 _MIN_READINGS = 10
 _MIN_ERROR = 0.012
 _MIN_SIGMAS = 6.0
+# A calibration is confirmed if, by so many of the newest readings and so many standard deviations, its focal length is
+# off by no more than this share.
+_CONFIRMING_READINGS = 30
+_CONFIRMED_SIGMAS = 3.0
+_MAX_CONFIRMED_ERROR = 0.01
 
 
 @dataclass(frozen=True)
@@ -47,7 +52,7 @@ class CameraHealth:
 
     def take(self, camera: Camera, estimate: Estimate) -> None:
         """Take the reading of an image, if it has one to be trusted; start anew with another calibration."""
-        calibration = (camera.width, camera.height, camera.model, camera.K.tobytes(), camera.distortion.tobytes())
+        calibration = _identity(camera)
         if calibration != self._calibration:
             self._calibration, self._readings = calibration, deque(maxlen=_MAX_READINGS)
             self._K = camera.K
@@ -57,15 +62,15 @@ class CameraHealth:
 
     @property
     def focal_length(self) -> FocalLength:
-        """Weighted mean of the readings; where they scatter more than they claim, its deviation is that much larger."""
-        readings = self._readings.copy()
-        if not readings:
-            return FocalLength(float("nan"), float("nan"), 0)
-        errors, sigmas = np.array(readings).T
-        weights = sigmas**-2
-        mean = weights @ errors / weights.sum()
-        scatter = weights @ (errors - mean) ** 2 / max(len(errors) - 1, 1)
-        return FocalLength(float(mean), float(np.sqrt(max(scatter, 1.0) / weights.sum())), len(errors))
+        """What all readings say."""
+        return _mean(list(self._readings.copy()))
+
+    def confirms(self, camera: Camera) -> bool:
+        """Return whether the readings are of this calibration, and the newest show that its focal length is right."""
+        focal = _mean(list(self._readings.copy())[-_CONFIRMING_READINGS:])
+        if focal.count < _MIN_READINGS or _identity(camera) != self._calibration:
+            return False
+        return abs(focal.error) + _CONFIRMED_SIGMAS * focal.sigma <= _MAX_CONFIRMED_ERROR
 
     @property
     def warning(self) -> str:
@@ -89,6 +94,26 @@ class CameraHealth:
             "focal_sigma": f"{focal.sigma:.4f}",
             "focal_answers": str(focal.count),
         }
+
+
+def _mean(readings: list[tuple[float, float]]) -> FocalLength:
+    """Return the weighted mean of readings; where they scatter more than they claim, its deviation is that much larger.
+
+    Args:
+        readings: errors and their standard deviations, relative.
+    """
+    if not readings:
+        return FocalLength(float("nan"), float("nan"), 0)
+    errors, sigmas = np.array(readings).T
+    weights = sigmas**-2
+    mean = weights @ errors / weights.sum()
+    scatter = weights @ (errors - mean) ** 2 / max(len(errors) - 1, 1)
+    return FocalLength(float(mean), float(np.sqrt(max(scatter, 1.0) / weights.sum())), len(errors))
+
+
+def _identity(camera: Camera) -> tuple[object, ...]:
+    """Return what tells one calibration from another."""
+    return camera.width, camera.height, camera.model, camera.K.tobytes(), camera.distortion.tobytes()
 
 
 def _is_refused_for_focal_length(estimate: Estimate) -> bool:

@@ -10,6 +10,7 @@ import numpy as np
 from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.localize.estimate import Estimate
 from gsfeatloc_ros.localize.options import MAX_SEED, LocalizerOptions
+from gsfeatloc_ros.ros_io.camera_health import CameraHealth
 from gsfeatloc_ros.ros_io.decode import frame_name, nanoseconds
 from gsfeatloc_ros.ros_io.inputs import Inputs, LocalizerInput, NewestInputs
 from gsfeatloc_ros.ros_io.message_types import AnyImage, Header
@@ -30,11 +31,13 @@ class Follower:
 
     Attributes:
         images_come: whether they come by themselves: then one may confirm another.
+        camera: what is known of their camera's calibration.
     """
 
     def __init__(self, inputs: Inputs, state: LocalizationState, track: bool) -> None:
         self._inputs, self.state, self._track = inputs, state, track
         self.images_come = True
+        self.camera = CameraHealth()
         # Of the images that come by themselves.
         self._camera_frame: str | None = None
         # Views of the index that were looked at in vain, and the stamp of the image from whose place they were.
@@ -57,7 +60,8 @@ class Follower:
     def options(self, options: LocalizerOptions, header: Header, query: LocalizerInput) -> LocalizerOptions:
         """Return the options for the next image, of this header: what was searched in vain is searched otherwise.
 
-        That is with another seed, and in other views of the index until the camera has moved.
+        That is with another seed, and in other views of the index until the camera has moved. Once many images have
+        shown that the focal length is right, one need not show it any more.
 
         Args:
             options: of the localizer.
@@ -67,7 +71,10 @@ class Follower:
         skipped = self._looked_at if self._is_where_it_looked(header) else 0
         seed = (options.seed + self.state.failures) % (MAX_SEED + 1)
         search = replace(options.search, skipped=skipped, usual_covariance=query.usual_covariance)
-        return replace(options, seed=seed, search=search)
+        limits = options.limits
+        if self.camera.confirms(query.camera):
+            limits = replace(limits, max_focal_error=1.0)
+        return replace(options, seed=seed, search=search, limits=limits)
 
     def take(self, query: LocalizerInput, header: Header, estimate: Estimate) -> Judgement:
         """Take what came of an image that came by itself, and return what is to be done.
@@ -78,6 +85,7 @@ class Follower:
             estimate: the answer, or none.
         """
         T_map_camera = estimate.T_map_camera
+        self.camera.take(query.camera, estimate)
         self._note_search(header, estimate)
         self._camera_frame = frame_name(header.frame_id)
         attempt = Attempt(

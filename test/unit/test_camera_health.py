@@ -132,3 +132,23 @@ def test_images_that_are_refused_for_other_reasons_do_not_count():
 def test_the_newest_readings_count():
     """A lens that was refocused."""
     assert filled([0.02] * 1000 + [0.0] * 1000).focal_length.error == 0.0
+
+
+def test_a_right_calibration_is_confirmed_by_some_readings():
+    rng = np.random.default_rng(0)
+    right = list(0.003 * rng.normal(size=30))
+    assert filled(right).confirms(CAMERA)
+    assert not filled(right[:9]).confirms(CAMERA)
+    assert not filled([]).confirms(CAMERA)
+    # Readings that know little.
+    assert not filled(right, sigma=0.03).confirms(CAMERA)
+    assert not filled(right).confirms(replace(CAMERA, distortion=np.array([0.1, 0, 0, 0, 0])))
+
+
+@pytest.mark.parametrize("error", [-0.02, 0.012, 0.05])
+def test_a_wrong_calibration_is_not_confirmed(error):
+    assert not filled([error] * 100, sigma=0.003).confirms(CAMERA)
+
+
+def test_a_lens_that_was_refocused_is_confirmed_no_more_after_some_images():
+    assert not filled([0.0] * 1000 + [0.05] * 3).confirms(CAMERA)

@@ -222,3 +222,21 @@ def test_time_passes_by_odometry_without_images():
     robot.drive(160)
     robot.follower.pass_time(images_wanted=False)
     assert robot.state is State.LOST
+
+
+def test_once_the_focal_length_is_known_an_image_need_not_show_it():
+    robot = Robot()
+    flat = Evidence(inliers=100, focal_error=0.0, focal_sigma=0.003)
+
+    def limit(seconds: float) -> float:
+        query = robot.follower.for_image(image(seconds))
+        return robot.follower.options(LocalizerOptions(), image(seconds).header, query).limits.max_focal_error
+
+    robot.drive(100)
+    assert limit(100) == LocalizerOptions().limits.max_focal_error
+    for seconds in range(100, 115):
+        robot.drive(seconds)
+        query = robot.follower.for_image(image(seconds))
+        answer = Estimate(Status.LOCALIZED, "", along(seconds), np.eye(6), evidence=flat)
+        robot.follower.take(query, image(seconds).header, answer)
+    assert limit(115) == 1.0
