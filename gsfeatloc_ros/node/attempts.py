@@ -137,9 +137,9 @@ class Attempts:
         self._worker.offer(job)
 
     @property
-    def busy_seconds(self) -> float:
-        """For how long the running localization has taken; 0 for none."""
-        return self._worker.busy_seconds
+    def silent_seconds(self) -> float:
+        """For how long the running localization has shown no sign of life; 0 for none."""
+        return self._worker.silent_seconds
 
     @property
     def waiting(self) -> int:

@@ -37,8 +37,8 @@ from gsfeatloc_ros.node.transforms import Transforms
 _MAX_STEP_BACK = Duration(seconds=1)
 # Seconds that the running localization gets to end when the node is cleaned up.
 _STOP_TIMEOUT = 3.0
-# Seconds that no localization takes; the widest search takes less than a minute.
-_MAX_BUSY = 300.0
+# Seconds without a sign of life from a localization that goes on; each of its steps takes less, on slow robots too.
+_MAX_SILENCE = 120.0
 
 
 _Transition = Callable[["LocalizerNode", LifecycleState], TransitionCallbackReturn]
@@ -109,8 +109,8 @@ class LocalizerNode(LifecycleNode):
 
     @property
     def stuck(self) -> bool:
-        """Whether a localization has begun that does not come to an end."""
-        return self._session is not None and self._session.attempts.busy_seconds > _MAX_BUSY
+        """Whether a localization has begun that does not go on."""
+        return self._session is not None and self._session.attempts.silent_seconds > _MAX_SILENCE
 
     @property
     def session(self) -> Session | None:

@@ -54,12 +54,16 @@ NO_TERMS = Terms()
 
 
 class _Task(Generic[Item, Result]):
-    """A piece of work: offered, or asked for by so many `requests`; one that `yields` gives way to a request."""
+    """A piece of work: offered, or asked for by so many `requests`; one that `yields` gives way to a request.
+
+    At the time `asked` it asked last whether to go on.
+    """
 
     def __init__(self, item: Item, terms: Terms = NO_TERMS) -> None:
         self.item, self.requests, self.yields = item, 0, False
         self.future: Future[Result] = Future()
         self.interrupted = Event()
+        self.asked = time.monotonic()
         self.set_terms(terms)
 
     def set_terms(self, terms: Terms) -> None:
@@ -70,6 +74,7 @@ class _Task(Generic[Item, Result]):
         return time.monotonic() > self.deadline
 
     def is_to_stop(self) -> bool:
+        self.asked = time.monotonic()
         return self.interrupted.is_set() or self.late
 
     def drop(self, reason: str) -> None:
@@ -129,10 +134,10 @@ class Worker(Generic[Item, Result]):
             return sum(task.requests for task in self._requested) + sharing
 
     @property
-    def busy_seconds(self) -> float:
-        """For how long it has worked on what it is working on; 0 for nothing."""
+    def silent_seconds(self) -> float:
+        """For how long what it works on has not asked whether to go on; 0 for nothing."""
         with self._changed:
-            return time.monotonic() - self._started if self._running else 0.0
+            return time.monotonic() - max(self._started, self._running.asked) if self._running else 0.0
 
     def offer(self, item: Item) -> None:
         """Work on `item` when it is its turn, unless a newer one is offered by then."""

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from node_harness import RESEND_PERIOD, TIMEOUT, NodeProcess, connected_client, node_arguments
 
-from gsfeatloc_ros.client.messages import camera_info_of, pose_with_covariance
+from gsfeatloc_ros.client.messages import camera_info_of, pose_stamped
 
 # Seconds of silence after which systemd would end it; a slow machine may hold it up for some.
 WATCHDOG = 8.0
@@ -100,30 +100,30 @@ def test_a_start_that_fails_is_never_ready(tmp_path):
         assert systemd.words() == []
 
 
-# As its executable, but for how long a localization may take.
-IMPATIENT = """
+# As its executable, but for how long a localization may be silent, and that each is, as one that hangs in native code.
+HANGING = """
 import sys
-from gsfeatloc_ros.node import localizer_node, main
-localizer_node._MAX_BUSY = 0.2
+import time
+from gsfeatloc_ros.node import attempts, localizer_node, main
+attempts.Attempts._attempt = lambda *arguments: time.sleep(1000)
+localizer_node._MAX_SILENCE = 0.2
 sys.exit(main.main())
 """
 
 
-def test_of_a_localization_that_does_not_end_no_beat_tells(room_map_file, room_camera, photo, tmp_path):
-    """One of many seconds: without an index all of a wide prior is searched for a photo of nothing in the map."""
-    arguments = node_arguments(map__path=room_map_file, localizer__max_views=1000, index__path=tmp_path / "none")
+def test_of_a_localization_that_hangs_no_beat_tells(room_map_file, room_camera, photo, tmp_path):
+    arguments = node_arguments(map__path=room_map_file)
     with listener(tmp_path) as systemd:
-        command = [sys.executable, "-c", IMPATIENT, *arguments]
+        command = [sys.executable, "-c", HANGING, *arguments]
         process = subprocess.Popen(command, env={**os.environ, **systemd.environment})
         try:
             systemd.wait_for("READY=1")
             with connected_client() as client:
                 client.send_camera_info(camera_info_of(room_camera))
-                wide = pose_with_covariance(photo.T_map_camera, np.diag([1.0, 1.0, 1.0, 10.0, 10.0, 10.0]))
-                client.send_prior(wide)
+                client.send_prior(pose_stamped(photo.T_map_camera_prior))
                 # Best effort may lose an image.
                 for _ in range(10):
-                    client.send_once(np.ascontiguousarray(photo.image[:, ::-1]))
+                    client.send_once(photo.image)
                     if client.spin_until(lambda: systemd.silence() > SILENCE, 2 * RESEND_PERIOD):
                         break
                 assert systemd.silence() > SILENCE

@@ -194,14 +194,25 @@ def test_what_nobody_waits_for_any_more_is_not_worked_on(gate, worker):
     assert gate.items == ["running", "after"]
 
 
-def test_it_tells_for_how_long_it_is_busy(gate, worker):
-    assert worker.busy_seconds == 0.0
+@pytest.mark.parametrize("asks", [False, True])
+def test_it_tells_for_how_long_its_work_has_not_asked_whether_to_go_on(asks):
+    started, go = threading.Event(), threading.Event()
+
+    def work(item, interrupted):
+        started.set()
+        while not go.wait(0.01):
+            if asks:
+                interrupted()
+
+    worker = Worker(work)
+    assert worker.silent_seconds == 0.0
     future = worker.request("a")
-    gate.wait_until_started()
-    time.sleep(0.02)
-    assert 0.02 <= worker.busy_seconds < TIMEOUT
-    gate.go.release()
+    assert started.wait(TIMEOUT)
+    time.sleep(1.0)
+    assert worker.silent_seconds < 0.5 if asks else 1.0 <= worker.silent_seconds < TIMEOUT
+    go.set()
     future.result(TIMEOUT)
+    assert worker.stop(TIMEOUT)
 
 
 def test_what_is_the_same_is_said_by_the_work():
