@@ -31,6 +31,8 @@ _MIN_SEEN = 0.2
 _MAX_NEAR = 0.05
 # What is aimed at is seen if something is seen at its distance but for this share.
 _MAX_DISTANCE_ERROR = 0.2
+# Pixels by which a projection may be rounded.
+_ROUNDING = 1e-6
 # A pixel shows a surface where it is covered so far and its depths spread over no more than this share of the depth.
 _MIN_ALPHA = 0.9
 _MAX_SPREAD = 0.15
@@ -90,10 +92,11 @@ def sees(render: Render, camera: Camera, T_map_camera: np.ndarray, target: np.nd
     depth = there[0, 2]
     if depth <= 0:
         return False
-    x, y = camera.project(there)[0].round()
+    # What is ahead lies between pixels: it is seen in the later of these, however it was rounded.
+    x, y = np.floor(camera.project(there)[0] + 0.5 + _ROUNDING).astype(int)
     if not (0 <= x < camera.width and 0 <= y < camera.height):
         return False
-    return bool(abs(float(render.median_depth[int(y), int(x)]) - depth) <= _MAX_DISTANCE_ERROR * depth)
+    return bool(abs(float(render.median_depth[y, x]) - depth) <= _MAX_DISTANCE_ERROR * depth)
 
 
 def seen_cells(render: Render, camera: Camera, T_map_camera: np.ndarray, near: float) -> set[int]:

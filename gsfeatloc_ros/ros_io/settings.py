@@ -212,15 +212,16 @@ class Settings:
         """Raise ValueError where something is asked for that needs a map which lies where the robot's map frame is."""
         if self.map.aligned:
             return
-        once = "set it to true once map.scale, map.translation and map.rotation put the map where"
+        there = "once map.scale, map.translation and map.rotation put the map where"
         if self.node.answer_frames().odom:
             raise ValueError(
-                f"publish_tf needs map.aligned: {once} the robot's map frame is; other nodes would believe a pose that "
-                "is off"
+                f"publish_tf needs map.aligned: set it to true {there} the robot's map frame is; other nodes would "
+                "believe a pose that is off"
             )
-        for name, asked in (("search.planar", self.recovery.planar), ("index.camera_height", self.index.on_plane)):
-            if asked:
-                raise ValueError(f"{name} needs map.aligned: {once} the floor is z = 0")
+        if self.recovery.planar:
+            raise ValueError(f"search.planar needs map.aligned: set it to true {there} the floor is z = 0")
+        if self.index.on_plane:
+            raise ValueError(f"index.camera_height needs map.aligned: set it to true {there} the floor is z = 0")
 
     def prior_policy(self) -> PriorPolicy:
         """Return what priors are worth."""
