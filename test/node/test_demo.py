@@ -13,7 +13,7 @@ from gsfeatloc_ros.client.bag_player import Reply, play_bag
 from gsfeatloc_ros.client.process import running_localizer
 from gsfeatloc_ros.client.score import score
 from gsfeatloc_ros.simulate import write_bag
-from gsfeatloc_ros.tools.demo import TOPICS, main, row, summary
+from gsfeatloc_ros.tools.demo import TOPICS, main, make_parser, row, summary
 
 
 def test_demo_localizes_photos_of_a_bag(tmp_path):
@@ -49,11 +49,11 @@ def test_failures_and_wrong_answers_are_not_successes(room_photos):
 
 
 def test_the_old_name_of_an_option_works_with_a_notice(capsys):
+    assert make_parser().parse_args(["--queries", "7"]).photos == 7
+    assert "--queries is now --photos" in capsys.readouterr().err
     with pytest.raises(SystemExit, match="2"):
-        main(["--queries", "0"])
-    said = capsys.readouterr().err
-    assert "--queries is now --photos" in said
-    assert "--photos must be at least 1" in said
+        main(["--photos", "0"])
+    assert "--photos: '0' is not a whole number of at least 1" in capsys.readouterr().err
 
 
 @pytest.fixture
