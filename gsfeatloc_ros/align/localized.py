@@ -37,9 +37,8 @@ def localize_bag(
     settings = replace(settings, node=replace(settings.node, track=True))
     with open_bag(path, topics) as bag:
         engine = load_engine(settings.map, settings.matcher, settings.renderer, settings.localizer)
-        index = index_for(
-            engine, settings.index, index_key(engine.map_path, settings.map, settings.matcher, settings.index)
-        )
+        key = index_key(engine.map_path, settings.map, settings.matcher, settings.index)
+        index = index_for(engine, settings.index, key)
         for image in Replay(bag, engine.with_index(index), settings, calibration).images():
             found = image.outcome.estimate
             if image.stamp is None or not image.outcome.localized or found is None or found.T_map_camera is None:

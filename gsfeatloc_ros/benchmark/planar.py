@@ -58,14 +58,14 @@ def measure_planar(counts: Sequence[int], photos: int, seed: int = 0) -> list[di
 def _photos(room: Room, count: int, seed: int) -> list[tuple[np.ndarray, np.ndarray]]:
     """Take photos (H, W, 3) from anywhere on the floor, in all directions; return each with its pose (4, 4)."""
     rng, camera = np.random.default_rng(seed), RoomCamera(room, _CAMERA)
-    shell = room.solids[0]
+    rays, shell = pixel_rays(_CAMERA), room.solids[0]
     photos: list[tuple[np.ndarray, np.ndarray]] = []
     while len(photos) < count:
         ground = shell.centre[:2] + 2 * shell.radius * rng.uniform(-0.5, 0.5, 2)
         position = np.array([*ground, _HEIGHT + _HEIGHT_SIGMA * rng.normal()])
         pose = make_pose(facing(rng.uniform(0, 2 * np.pi), *_TILT_SIGMA * rng.normal(size=2)), position)
         free = room.is_free(position[None], MIN_CLEARANCE)[0]
-        if free and np.median(room.cast(pixel_rays(_CAMERA), pose)[1]) > _MIN_DEPTH:
+        if free and np.median(room.cast(rays, pose)[1]) > _MIN_DEPTH:
             photos.append((camera.photo(partial(_still, pose), 0.0, rng), pose))
     return photos
 

@@ -72,10 +72,8 @@ def _prepare(options: argparse.Namespace) -> int:
     map_ = replace(MapSettings(str(bundle.folder)).resolved(), cache=True)
     renderer = load_renderer(map_, RendererSettings(options.device, options.threads))
     print_reading("prepare", renderer)
-    index_file, key = (
-        index_path(map_.path),
-        index_key(map_.path, map_, matcher_settings(options), index_settings(options)),
-    )
+    index_file = index_path(map_.path)
+    key = index_key(map_.path, map_, matcher_settings(options), index_settings(options))
     index = load_or_make(index_file, key, lambda: make_index(options, renderer, poses))
     derived = [bundle.map.with_name(bundle.map.name + SUFFIX), index_file]
     if not options.skip_inspection:
