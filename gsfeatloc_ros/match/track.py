@@ -11,16 +11,12 @@ from gsfeatloc_ros.common.arrays import Array, to_host
 from gsfeatloc_ros.common.local_structure import local_structure
 from gsfeatloc_ros.common.photo import Photo
 from gsfeatloc_ros.match.base import Matches, Worth, all_of_them
+from gsfeatloc_ros.match.corners import find_corners
 from gsfeatloc_ros.match.flow import WINDOW, Pyramid, flow
 
-# Corners (Shi and Tomasi, 1994): how many, how many pixels apart, of what part of the strongest one's strength, and
-# over a block of how many pixels a side that is measured.
+# Most corners of a photo that are tracked into renders, and of a render into the photo.
 MAX_CORNERS = 800
-# Of a render, that are tracked into the photo.
 MAX_RENDER_CORNERS = 300
-MIN_CORNER_DISTANCE = 7
-MIN_CORNER_QUALITY = 0.005
-CORNER_BLOCK = 5
 # The images that are compared: local structure (common/local_structure.py), its zero in the middle of a byte's range.
 STRUCTURE_SIGMA = 12.0
 STRUCTURE_MIN_CONTRAST = 8.0
@@ -43,7 +39,7 @@ class CornerTracker:
     def __init__(self, photo: Photo) -> None:
         gray = photo.gray()
         self._structure = _structure(gray)
-        self.corners = _find_corners(gray, MAX_CORNERS, seen_off_the_border(photo))
+        self.corners = find_corners(gray, MAX_CORNERS, seen_off_the_border(photo))
         self._last_render: _Seen | None = None
 
     def track(self, image: Array, worth: Worth = all_of_them) -> Matches:
@@ -60,7 +56,7 @@ class CornerTracker:
         `a` of the matches are the photo's pixels.
         """
         render = self._see(image)
-        corners = _find_corners(render.gray, MAX_RENDER_CORNERS, None)
+        corners = find_corners(render.gray, MAX_RENDER_CORNERS)
         return _there_and_back(render.structure, self._structure, corners[worth(corners)]).swapped()
 
     def _see(self, image: Array) -> _Seen:
@@ -83,14 +79,6 @@ class _Seen:
 def seen_off_the_border(photo: Photo) -> np.ndarray:
     """Return where to look for corners, (H, W) uint8: the border of what the lens saw is no corner of the world."""
     return cv2.erode(photo.seen.astype(np.uint8), np.ones((WINDOW, WINDOW), np.uint8))
-
-
-def _find_corners(gray: np.ndarray, count: int, seen: np.ndarray | None) -> np.ndarray:
-    """Find at most `count` corners (N, 2) float32 of brightness (H, W) uint8 where `seen` (H, W) uint8 is not 0."""
-    corners = cv2.goodFeaturesToTrack(
-        gray, count, MIN_CORNER_QUALITY, MIN_CORNER_DISTANCE, mask=seen, blockSize=CORNER_BLOCK
-    )
-    return np.empty((0, 2), np.float32) if corners is None else corners.reshape(-1, 2)
 
 
 def _there_and_back(here: Pyramid, there: Pyramid, corners: np.ndarray) -> Matches:

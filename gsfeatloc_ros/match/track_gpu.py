@@ -14,14 +14,12 @@ from torch.nn.functional import avg_pool2d, conv2d, grid_sample, max_pool2d, pad
 from gsfeatloc_ros.common.arrays import Array, to_device, to_host
 from gsfeatloc_ros.common.photo import Photo
 from gsfeatloc_ros.match.base import Matches, Worth, all_of_them
+from gsfeatloc_ros.match.corners import CORNER_BLOCK, MIN_CORNER_DISTANCE, MIN_CORNER_QUALITY
 from gsfeatloc_ros.match.flow import MAX_LEVEL, WINDOW
 from gsfeatloc_ros.match.tensor import LUMA
 from gsfeatloc_ros.match.track import (
-    CORNER_BLOCK,
     MAX_CORNERS,
     MAX_RETURN_ERROR,
-    MIN_CORNER_DISTANCE,
-    MIN_CORNER_QUALITY,
     STRUCTURE_GAIN,
     STRUCTURE_MIN_CONTRAST,
     STRUCTURE_SIGMA,
@@ -113,7 +111,7 @@ def _flow(
 
 
 def _find_corners(gray: torch.Tensor, seen: torch.Tensor, sobel: torch.Tensor) -> np.ndarray:
-    """Find the strongest corners (N, 2) float32 of brightness (H, W) where `seen` (H, W), as goodFeaturesToTrack."""
+    """Find the strongest corners (N, 2) float32 of brightness (H, W) where `seen` (H, W), as match/corners.py."""
     gx, gy = _filtered(gray, sobel)[0]
     around = pad(torch.stack([gx * gx, gx * gy, gy * gy])[None], [CORNER_BLOCK // 2] * 4, mode="replicate")
     strength = _least_eigenvalue(*avg_pool2d(around, CORNER_BLOCK, 1)[0]) * seen

@@ -12,9 +12,9 @@ import torch
 from pictures import photo_of, smooth_noise
 from stand_in.gpu import simulated_gpu
 
+from gsfeatloc_ros.match.corners import MIN_CORNER_DISTANCE
 from gsfeatloc_ros.match.track import (
     MAX_CORNERS,
-    MIN_CORNER_DISTANCE,
     STRUCTURE_GAIN,
     STRUCTURE_MIN_CONTRAST,
     STRUCTURE_SIGMA,
