@@ -11,17 +11,24 @@ from typing import Any
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseArray, PoseStamped, PoseWithCovarianceStamped
-from rclpy.qos import QoSProfile
-from sensor_msgs.msg import Image
+from nav_msgs.msg import Odometry
+from rcl_interfaces.srv import GetParameters
+from rclpy.qos import QoSProfile, qos_profile_sensor_data
+from rclpy.task import Future
+from sensor_msgs.msg import CameraInfo, Image
 
 from gsfeatloc_ros.client.client_node import ClientNode
 from gsfeatloc_ros.client.messages import pose_with_covariance, read_diagnostics
 from gsfeatloc_ros.node.qos import LATCHED, RELIABLE
 from gsfeatloc_ros.ros_io.decode import decode_covariance, decode_pose, nanoseconds
 from gsfeatloc_ros.ros_io.raw_image import decode_image
+from gsfeatloc_ros.ros_io.settings import BASE
 from gsfeatloc_ros.view.attempts import Attempt, Prior
 from gsfeatloc_ros.view.jpeg import encoded
 from gsfeatloc_ros.view.store import Store
+
+# Seconds after which the node is asked again of what its priors are: it may have been started anew.
+_ASKED_EVERY = 2.0
 
 
 class LiveNode(ClientNode):
@@ -48,9 +55,16 @@ class LiveNode(ClientNode):
         self._listen(PoseArray, f"{name}/candidates", self._on_candidates)
         self._listen(PoseArray, f"{name}/searched", self._on_searched)
         self._listen(Image, "debug_image", self._on_debug_image)
+        # Of what priors are, and the camera's frame, once that is known; until then, the prior that waits for it.
+        self._prior_frame = self._camera_frame = ""
+        self._waiting: PoseStamped | PoseWithCovarianceStamped | Odometry | None = None
         self._listen(PoseStamped, "prior", self._on_prior)
         self._listen(PoseWithCovarianceStamped, "prior_with_covariance", self._on_prior)
-        self._listen(PoseWithCovarianceStamped, "initialpose", partial(self._on_prior, of_base=True))
+        self._listen(PoseWithCovarianceStamped, "initialpose", partial(self._add_prior, of_base=True))
+        self._listen(Odometry, "prior_odometry", self._on_prior)
+        self._listen(CameraInfo, "camera_info", self._on_camera_info, qos_profile_sensor_data)
+        self._parameters = self.node.create_client(GetParameters, f"{name}/get_parameters")
+        self.node.create_timer(_ASKED_EVERY, self._ask)
         self._stopped = threading.Event()
         self._thread = threading.Thread(target=self._run, name="live", daemon=True)
         self._thread.start()
@@ -116,7 +130,36 @@ class LiveNode(ClientNode):
     def _on_debug_image(self, message: Image) -> None:
         self._store.add_picture(nanoseconds(message.header.stamp), encoded(decode_image(message)))
 
-    def _on_prior(self, message: PoseStamped | PoseWithCovarianceStamped, of_base: bool = False) -> None:
+    def _ask(self) -> None:
+        if self._parameters.service_is_ready():
+            request = GetParameters.Request(names=["prior_frame"])
+            self._parameters.call_async(request).add_done_callback(self._on_parameters)
+
+    def _on_parameters(self, answer: Future) -> None:
+        (value,) = answer.result().values
+        self._prior_frame = value.string_value
+        self._add_waiting()
+
+    def _on_camera_info(self, message: CameraInfo) -> None:
+        self._camera_frame = message.header.frame_id
+        self._add_waiting()
+
+    def _on_prior(self, message: PoseStamped | PoseWithCovarianceStamped | Odometry) -> None:
+        self._waiting = message
+        self._add_waiting()
+
+    def _add_waiting(self) -> None:
+        """Add the prior that waits, if it is known of what it is."""
+        message = self._waiting
+        if isinstance(message, Odometry):
+            known, of_base = self._camera_frame, message.child_frame_id != self._camera_frame
+        else:
+            known, of_base = self._prior_frame, self._prior_frame == BASE
+        if message is not None and known:
+            self._waiting = None
+            self._add_prior(message, of_base)
+
+    def _add_prior(self, message: PoseStamped | PoseWithCovarianceStamped | Odometry, of_base: bool) -> None:
         if message.header.frame_id == self._frame:
             self._store.add_prior(Prior(decode_pose(message, "prior"), of_base))
 

@@ -99,7 +99,9 @@ def _given(options: argparse.Namespace) -> MapSettings:
     aligned = values.get("map.path")
     if aligned and os.path.exists(aligned) and not os.path.samefile(aligned, options.map):
         raise ValueError(f"{options.align}: is of another map, {aligned}, not of {options.map}")
-    return Settings.checked(values | given_map(options)).map.resolved()
+    settings = Settings.checked(values | given_map(options)).resolved()
+    replace(settings, index=index_settings(options)).check_plane()
+    return settings.map
 
 
 def _plan(options: argparse.Namespace, given: MapSettings) -> tuple[Bundle, dict[str, Path]]:

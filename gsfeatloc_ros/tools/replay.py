@@ -118,7 +118,7 @@ def _settings(options: argparse.Namespace) -> Settings:
     """Return the node's settings as the options have them: a parameter file, what -p sets, options of their own.
 
     Raises:
-        ValueError: there is no such parameter, or it does not take such a value.
+        ValueError: there is no such parameter, it does not take such a value, or it needs a map that is aligned.
     """
     values = read_parameter_file(options.params_file) if options.params_file else {}
     values |= dict(options.parameter)
@@ -134,6 +134,7 @@ def _settings(options: argparse.Namespace) -> Settings:
     values |= {name: value for name, value in own.items() if value is not None}
     values |= {f"localizer.{name}": value for name, value in options.set.items()}
     settings = Settings.checked(values, _say).resolved()
+    settings.check_plane()
     for name in _WITHOUT_EFFECT:
         if name in values:
             _say(f"parameter {name} has no effect here")

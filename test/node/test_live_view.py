@@ -37,7 +37,9 @@ def live():
 
 @pytest.fixture
 def robot():
-    node = ClientNode("robot")
+    """What a localizer called /robot/localizer says, and the robot."""
+    node = ClientNode("localizer", "/robot")
+    node.node.declare_parameter("prior_frame", "camera")
     yield node
     node.close()
 
@@ -59,7 +61,7 @@ def test_an_attempt_is_put_together_of_all_that_a_node_says_of_it(live, robot):
     _, store = live
     stamp = Time(sec=5, nanosec=7)
     publisher(robot, PoseStamped, "/robot/prior").publish(pose_stamped(POSE))
-    wait_for(lambda: store.newest_prior is not None)
+    assert robot.spin_until(lambda: store.newest_prior is not None, 30)
     answer, elsewhere = pose_with_covariance(POSE, np.eye(6)), pose_with_covariance(POSE, frame_id="odom")
     answer.header.stamp = stamp
     poses = publisher(robot, PoseWithCovarianceStamped, "/robot/answers")
@@ -89,6 +91,42 @@ def test_an_attempt_is_put_together_of_all_that_a_node_says_of_it(live, robot):
     assert not store.prior(STAMP).of_base
 
 
+@pytest.mark.parametrize("prior_frame", ["camera", "base"])
+def test_a_prior_is_drawn_of_what_the_node_takes_it_for(live, robot, prior_frame):
+    from geometry_msgs.msg import PoseStamped
+    from rclpy.parameter import Parameter
+
+    _, store = live
+    robot.node.set_parameters([Parameter("prior_frame", value=prior_frame)])
+    # It may come before the node has said so.
+    publisher(robot, PoseStamped, "/robot/prior").publish(pose_stamped(POSE))
+    assert robot.spin_until(lambda: store.newest_prior is not None, 30)
+    np.testing.assert_allclose(store.newest_prior.pose, POSE)
+    assert store.newest_prior.of_base == (prior_frame == "base")
+
+
+def test_a_prior_of_odometry_is_of_the_frame_that_it_names(live, robot):
+    from nav_msgs.msg import Odometry
+    from sensor_msgs.msg import CameraInfo
+    from std_msgs.msg import Header
+
+    _, store = live
+    priors = publisher(robot, Odometry, "/robot/prior_odometry")
+    prior = Odometry(header=Header(frame_id="map"), child_frame_id="optical")
+    prior.pose.pose = pose_stamped(POSE).pose
+    priors.publish(prior)
+    time.sleep(0.5)
+    # Nobody knows yet what the camera's frame is.
+    assert store.newest_prior is None
+    publisher(robot, CameraInfo, "/robot/camera_info").publish(CameraInfo(header=Header(frame_id="optical")))
+    wait_for(lambda: store.newest_prior is not None)
+    assert not store.newest_prior.of_base
+    prior.child_frame_id = "body"
+    priors.publish(prior)
+    wait_for(lambda: store.newest_prior.of_base)
+    np.testing.assert_allclose(store.newest_prior.pose, POSE)
+
+
 def test_priors_are_sent_as_rviz_does_and_of_the_camera(live, robot):
     from geometry_msgs.msg import PoseWithCovarianceStamped
 
@@ -109,7 +147,7 @@ def test_priors_are_sent_as_rviz_does_and_of_the_camera(live, robot):
     assert got[0].pose.pose.position.y == 2.0
     assert got[0].pose.covariance[0] == 1.0
     # On two topics, what was sent first may be heard last.
-    wait_for(lambda: node.send_camera(POSE, np.eye(6)) and not store.newest_prior.of_base)
+    assert robot.spin_until(lambda: node.send_camera(POSE, np.eye(6)) and not store.newest_prior.of_base, 30)
 
 
 def test_a_running_localizer_takes_the_prior_of_two_clicks_and_is_seen(tf, room_map_file, room_camera, photo):

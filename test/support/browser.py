@@ -60,12 +60,24 @@ class Browser:
         return wait_for(lambda: self.run(script), script)
 
     def press(self, text: str) -> None:
-        """Click the button or tab that has a text, with the mouse: some do not hear of other clicks."""
+        """Click the button or tab that has a text, with the mouse: some do not hear of other clicks.
+
+        Not before it lies still with nothing over it: while a page unfolds, a click meets what was there before.
+        """
         button = (
             f"[...document.querySelectorAll('button,[role=tab]')].find(b => b.textContent.includes({json.dumps(text)}))"
         )
-        middle = "(b.scrollIntoView(), (r => [r.x + r.width / 2, r.y + r.height / 2])(b.getBoundingClientRect()))"
-        self.click(*self.wait_for(f"(b => b && {middle})({button})"))
+        middle = "(r => [r.x + r.width / 2, r.y + r.height / 2])(b.getBoundingClientRect())"
+        seen = f"(at => b.contains(document.elementFromPoint(...at)) && at)((b.scrollIntoView(), {middle}))"
+        place = None
+
+        def lies_still() -> bool:
+            nonlocal place
+            before, place = place, self.run(f"(b => b && {seen})({button})")
+            return bool(place) and place == before
+
+        wait_for(lies_still, f"a button {text} that lies still")
+        self.click(*place)
 
     def click(self, x: float, y: float) -> None:
         """Click with the mouse at a pixel of the page."""

@@ -193,6 +193,7 @@ def test_what_prepare_cannot_use_is_said_in_one_line(bundle, room_map_file, tmp_
         ([room, "--out", str(bundle)], "has an alignment, which would be lost"),
         ([room, "--out", str(bundle / "manifest.json")], "is a file"),
         ([room, "--out", str(tmp_path / "new"), "--align", str(tmp_path / "other.yaml")], "localizer.seed"),
+        ([room, "--out", str(tmp_path / "new"), "--camera-height", "0.4"], "index.camera_height needs map.aligned"),
         ([str(tmp_path / "nowhere.ply"), "--out", str(tmp_path / "new")], "nowhere.ply: cannot be read"),
     ]:
         assert prepare.main(arguments) == 2

@@ -316,6 +316,8 @@ def refused(capsys, arguments: list[str]) -> str:
         ("--map", "/no.ply", "/no.ply: cannot be read"),
         ("--map-rotation", "0 0 0 0", "has no direction"),
         ("--map-scale", "-1", "parameter map.scale: -1.0 is not within 1e-06 and 1e+06"),
+        ("-p", "search.planar:=true", "search.planar needs map.aligned: set it to true once"),
+        ("-p", "index.camera_height:=0.4", "index.camera_height needs map.aligned: set it to true once"),
     ],
 )
 def test_options_that_cannot_be_used(room_camera, room_photos, room_map_file, tmp_path, capsys, option, topic, says):
