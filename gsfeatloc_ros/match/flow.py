@@ -21,6 +21,9 @@ MAX_LEVEL = 3
 """Levels of the pyramid are 0 to this."""
 # Columns in memory of a window with a margin: lanes, which are one more than a window's columns, and the margins.
 _STRIDE = LANES + 2
+# Of a window, of which there are three: its brightness, and its gradient to the right and down. It has rows of lanes, of
+# which the last is not used.
+_WINDOW_SIZE = WINDOW * LANES
 _HALF = np.float32((WINDOW - 1) / 2)
 # A window may stick out wholly, and needs a pixel more for its gradients and another between pixels.
 _BORDER = LANES + 2
@@ -74,83 +77,90 @@ def flow(here: Pyramid, there: Pyramid, pixels: np.ndarray) -> tuple[np.ndarray,
 @njit(cache=True, nogil=True, error_model="numpy")
 def _follow(here, there, corners, moved, found):
     """Move the guesses `moved` (N, 2) to where the windows of a level's corners are in another, and say which are."""
+    # Kernels below take flat arrays and numbers alone: numba counts who uses an array, which takes longer than they do.
+    height, stride = here.shape[0] - 2 * _BORDER, here.shape[1]
+    width = stride - 2 * _BORDER
+    here, there = here.ravel(), there.ravel()
     patch = np.empty((WINDOW + 2) * _STRIDE, np.float32)
-    # Brightness of a window, and its gradient to the right and down: rows of lanes, of which the last is not used.
-    window = np.empty((3, WINDOW * LANES), np.float32)
+    window = np.empty(3 * _WINDOW_SIZE, np.float32)
     used = np.empty(LANES, np.float32)
     for corner in range(len(corners)):
         found[corner] = False
-        if not _is_inside(here, corners[corner]):
+        # Where its window begins.
+        x, y = corners[corner, 0] - _HALF, corners[corner, 1] - _HALF
+        if not _is_inside(x, y, width, height):
             continue
-        _cut_out(here, corners[corner], patch)
-        xx, xy, yy = _differentiate(patch, *_visible(here, corners[corner], used), window)
+        _cut_out(here, stride, x, y, patch)
+        _mark_used(x, width, used)
+        top = _whole(y)
+        xx, xy, yy = _differentiate(patch, used, max(0, -top), min(WINDOW, height - top), window)
         least = (xx + yy - math.sqrt((xx - yy) ** 2 + 4 * xy**2)) / (2 * WINDOW * WINDOW)
         if least < _MIN_EIGENVALUE:
             continue
         scale = 1 / (xx * yy - xy * xy)
         before_x = before_y = np.float32(0)
+        x, y = moved[corner, 0], moved[corner, 1]
         for iteration in range(_MAX_ITERATIONS):
-            if not _is_inside(there, moved[corner]):
+            if not _is_inside(x - _HALF, y - _HALF, width, height):
                 break
-            x, y = _mismatch(there, moved[corner], window)
-            step_x, step_y = scale * (xy * y - yy * x), scale * (xy * x - xx * y)
-            moved[corner, 0] += step_x
-            moved[corner, 1] += step_y
+            off_x, off_y = _mismatch(there, stride, x - _HALF, y - _HALF, window)
+            step_x, step_y = scale * (xy * off_y - yy * off_x), scale * (xy * off_x - xx * off_y)
+            x, y = np.float32(x + step_x), np.float32(y + step_y)
             if step_x * step_x + step_y * step_y <= _MIN_STEP**2:
                 break
             if iteration > 0 and abs(step_x + before_x) < _MIN_CHANGE and abs(step_y + before_y) < _MIN_CHANGE:
-                moved[corner, 0] -= step_x / 2
-                moved[corner, 1] -= step_y / 2
+                x, y = np.float32(x - step_x / 2), np.float32(y - step_y / 2)
                 break
             before_x, before_y = step_x, step_y
-        found[corner] = _is_inside(there, moved[corner])
+        moved[corner, 0], moved[corner, 1] = x, y
+        found[corner] = _is_inside(x - _HALF, y - _HALF, width, height)
 
 
 @njit(cache=True, nogil=True)
-def _is_inside(level, pixel):
-    """Return whether the window round a pixel has a part in the picture."""
-    height, width = level.shape[0] - 2 * _BORDER, level.shape[1] - 2 * _BORDER
-    x, y = math.floor(pixel[0] - _HALF), math.floor(pixel[1] - _HALF)
+def _is_inside(x, y, width, height):
+    """Return whether the window that begins at a pixel has a part in a picture of this size."""
     return -WINDOW <= x < width and -WINDOW <= y < height
 
 
 @njit(cache=True, nogil=True)
-def _corner_of(level, pixel, margin):
-    """Return where in a level the window round a pixel begins, with a margin; and its shares of the pixels after."""
-    x, y = pixel[0] - _HALF, pixel[1] - _HALF
-    left, top = math.floor(x), math.floor(y)
-    begin = (top - margin + _BORDER) * level.shape[1] + left - margin + _BORDER
-    return begin, np.float32(x - left), np.float32(y - top)
+def _whole(x):
+    """Return a number that is inside of a level's border, rounded down; math.floor is a call."""
+    return np.int64(x + _BORDER) - _BORDER
 
 
 @njit(cache=True, nogil=True)
-def _row(flat, at, share):
-    """Return lanes of a picture from `at` on, moved to the right by a share of a pixel."""
-    here = load(flat, at)
-    return here + share * (load(flat, at + 1) - here)
+def _place(stride, x, y):
+    """Return where in a level a pixel is, rounded down; and its shares of the pixels after."""
+    left, top = _whole(x), _whole(y)
+    return (top + _BORDER) * stride + left + _BORDER, np.float32(x - left), np.float32(y - top)
 
 
 @njit(cache=True, nogil=True)
-def _cut_out(level, pixel, patch):
-    """Fill in the window round a pixel with a margin of one, between the pixels."""
-    flat, stride = level.ravel(), level.shape[1]
-    begin, right, down = _corner_of(level, pixel, 1)
+def _row(level, at, share):
+    """Return lanes of a level from `at` on, moved to the right by a share of a pixel."""
+    here = load(level, at)
+    return here + share * (load(level, at + 1) - here)
+
+
+@njit(cache=True, nogil=True)
+def _cut_out(level, stride, x, y, patch):
+    """Fill in the window that begins at a pixel, with a margin of one, between the pixels."""
+    begin, right, down = _place(stride, x, y)
+    begin -= stride + 1
     for column in (0, _STRIDE - LANES):
-        above = _row(flat, begin + column, right)
+        above = _row(level, begin + column, right)
         for row in range(WINDOW + 2):
-            below = _row(flat, begin + column + (row + 1) * stride, right)
+            below = _row(level, begin + column + (row + 1) * stride, right)
             store(patch, row * _STRIDE + column, above + down * (below - above))
             above = below
 
 
 @njit(cache=True, nogil=True)
-def _visible(level, pixel, used):
-    """Return which columns of the window round a pixel the picture has, as lanes, and its first and end row there."""
-    height, width = level.shape[0] - 2 * _BORDER, level.shape[1] - 2 * _BORDER
-    left, top = math.floor(pixel[0] - _HALF), math.floor(pixel[1] - _HALF)
+def _mark_used(x, width, used):
+    """Fill in 1 for the columns of the window that begins at a column which the picture has, and 0 for the others."""
+    left = _whole(x)
     for column in range(LANES):
         used[column] = column < WINDOW and 0 <= left + column < width
-    return load(used, 0), max(0, -top), min(WINDOW, height - top)
 
 
 @njit(cache=True, nogil=True)
@@ -159,31 +169,32 @@ def _differentiate(patch, used, first, end, window):
 
     Columns that are not `used`, and rows before the `first` and from the `end` on, have no gradient.
     """
+    columns = load(used, 0)
     xx = xy = yy = broadcast(np.float32(0))
     for row in range(WINDOW):
         top, middle, low = row * _STRIDE, (row + 1) * _STRIDE, (row + 2) * _STRIDE
         falling = load(patch, low + 2) - load(patch, top)
         rising = load(patch, top + 2) - load(patch, low)
-        unit = used * np.float32(1 / 32 if first <= row < end else 0)
+        unit = columns * np.float32(1 / 32 if first <= row < end else 0)
         x = unit * (3 * (falling + rising) + 10 * (load(patch, middle + 2) - load(patch, middle)))
         y = unit * (3 * (falling - rising) + 10 * (load(patch, low + 1) - load(patch, top + 1)))
-        store(window[0], row * LANES, load(patch, middle + 1))
-        store(window[1], row * LANES, x)
-        store(window[2], row * LANES, y)
+        store(window, row * LANES, load(patch, middle + 1))
+        store(window, _WINDOW_SIZE + row * LANES, x)
+        store(window, 2 * _WINDOW_SIZE + row * LANES, y)
         xx, xy, yy = xx + x * x, xy + x * y, yy + y * y
     return total(xx), total(xy), total(yy)
 
 
 @njit(cache=True, nogil=True)
-def _mismatch(level, pixel, window):
-    """Return the sums of a window's gradients times what the level round a pixel differs by from it."""
-    flat, stride = level.ravel(), level.shape[1]
-    begin, right, down = _corner_of(level, pixel, 0)
-    x = y = broadcast(np.float32(0))
-    above = _row(flat, begin, right)
+def _mismatch(level, stride, x, y, window):
+    """Return the sums of a window's gradients times what the level differs by from it where it begins at a pixel."""
+    begin, right, down = _place(stride, x, y)
+    by_x = by_y = broadcast(np.float32(0))
+    above = _row(level, begin, right)
     for row in range(WINDOW):
-        below = _row(flat, begin + (row + 1) * stride, right)
-        off = above + down * (below - above) - load(window[0], row * LANES)
-        x, y = x + off * load(window[1], row * LANES), y + off * load(window[2], row * LANES)
+        below = _row(level, begin + (row + 1) * stride, right)
+        off = above + down * (below - above) - load(window, row * LANES)
+        by_x = by_x + off * load(window, _WINDOW_SIZE + row * LANES)
+        by_y = by_y + off * load(window, 2 * _WINDOW_SIZE + row * LANES)
         above = below
-    return total(x), total(y)
+    return total(by_x), total(by_y)
