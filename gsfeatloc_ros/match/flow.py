@@ -21,7 +21,7 @@ MAX_LEVEL = 3
 """Levels of the pyramid are 0 to this."""
 # Columns in memory of a window with a margin: lanes, which are one more than a window's columns, and the margins.
 _STRIDE = LANES + 2
-# Of a window, of which there are three: its brightness, and its gradient to the right and down. It has rows of lanes, of
+# Of a window, of which there are three: its brightness, and its gradient to the right and down. Its rows are lanes, of
 # which the last is not used.
 _WINDOW_SIZE = WINDOW * LANES
 _HALF = np.float32((WINDOW - 1) / 2)
