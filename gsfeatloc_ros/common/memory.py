@@ -10,12 +10,13 @@ from collections.abc import Iterator
 from pathlib import Path
 
 _PROC, _CGROUPS = Path("/proc"), Path("/sys/fs/cgroup")
-# Of glibc's mallopt(3): what is set, and to how many bytes. The pictures of a localization take 10 to 30 MB in all.
-_KEPT_MEMORY = {"TRIM_THRESHOLD": (-1, 64 * 2**20), "MMAP_THRESHOLD": (-3, 32 * 2**20)}
+# Of glibc's mallopt(3): what is set, and to how many bytes. The pictures of a localization take 10 to 30 MB in all, each
+# at most 4 MB: images of 1080p, of which requests may bring many, are larger, and go back at once.
+_KEPT_MEMORY = {"TRIM_THRESHOLD": (-1, 32 * 2**20), "MMAP_THRESHOLD": (-3, 5 * 2**20)}
 
 
 def keep_freed_memory() -> None:
-    """Let the C library (glibc) keep the memory of pictures that are gone for the next ones, up to 64 MB of it.
+    """Let the C library (glibc) keep the memory of pictures that are gone for the next ones, up to 32 MB of it.
 
     Given back to the system it would come anew page by page, each of them zeroed: that took 4 ms of a localization of
     56, and 10 of one of 95. Where the environment sets one of these limits (MALLOC_TRIM_THRESHOLD_, GLIBC_TUNABLES),
