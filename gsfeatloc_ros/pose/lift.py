@@ -55,38 +55,30 @@ def lift(render: Render, camera: Camera, T_map_camera: np.ndarray, pixels: np.nd
     The median, not the mean: semi-transparent floaters between the camera and the surface drag the mean along.
     Pixels outside the image, on edges of the depth or on thin splats are not valid.
     """
-    height, width = render.depth.shape
-    x, y = pixels[:, 0], pixels[:, 1]
-    inside = (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
-    column = np.clip(np.floor(np.where(inside, x, 0)).astype(int), 0, max(width - 2, 0))
-    row = np.clip(np.floor(np.where(inside, y, 0)).astype(int), 0, max(height - 2, 0))
-    rows = row[:, None] + np.array([0, 0, 1, 1]) * (height > 1)
-    columns = column[:, None] + np.array([0, 1, 0, 1]) * (width > 1)
-    fx, fy = np.clip(x - column, 0, 1), np.clip(y - row, 0, 1)
-    weights = np.stack([(1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy], axis=1)
+    # Not before the first: numba takes a second to load, and makes a folder.
+    from gsfeatloc_ros.pose.kernels import bilinear_neighbours, surface_depths
 
-    depths, depth_stds, alphas = _sampled(render, rows, columns)  # (M, 4) each, NaN where there is none
-    depth = (weights * depths).sum(axis=1)
-    spread = (weights * depth_stds).sum(axis=1)
-    depth_std = np.minimum(spread, MAX_DEPTH_STD * depth)
-    # Comparisons with NaN are false: what has no depth is not valid.
-    one_surface = depths.max(axis=1) - depths.min(axis=1) <= options.max_depth_step * depth
-    seen_surface = spread <= options.max_depth_spread * depth
-    valid = inside & (alphas.min(axis=1) >= options.min_alpha) & one_surface & seen_surface
-    depth = np.where(valid, depth, np.nan)
+    height, width = render.depth.shape
+    pixels = np.ascontiguousarray(pixels, np.float64)
+    places, weights = bilinear_neighbours(pixels, width, height)
+    limits = options.min_alpha, options.max_depth_step, options.max_depth_spread
+    depth, depth_std = surface_depths(*_on_host(render, places), weights, *limits)
+    depth_std = np.minimum(depth_std, MAX_DEPTH_STD * depth)
     rays = camera.rays(pixels)
     points = transform(T_map_camera, rays * depth[:, None])
     sigmas = (rays * (DEPTH_SIGMA_PER_STD * depth_std)[:, None]) @ T_map_camera[:3, :3].T
-    return Lifted(points, np.where(valid[:, None], sigmas, np.nan), valid)
+    return Lifted(points, sigmas, np.isfinite(depth))
 
 
-def _sampled(render: Render, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """Median depth, its spread and alpha at pixels: (3, ...) float64, all of the render that comes to the host."""
+def _on_host(render: Render, places: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Median depth, its spread and alpha, flat, with places (M, 4) in them where they are as at these in the render."""
     pictures = (render.median_depth, render.depth_std, render.alpha)
     if isinstance(render.alpha, np.ndarray):
-        return np.stack([picture[rows, columns] for picture in pictures]).astype(np.float64)
+        median_depth, depth_std, alpha = (picture.ravel() for picture in pictures)
+        return median_depth, depth_std, alpha, places
     import torch
 
-    # In one copy each way.
-    pixels = to_device(rows * render.alpha.shape[1] + columns, render.alpha.device)
-    return torch.stack([picture.flatten()[pixels] for picture in pictures]).cpu().double().numpy()
+    # All of the render that comes to the host, in one copy each way.
+    there = to_device(places.ravel(), render.alpha.device)
+    median_depth, depth_std, alpha = torch.stack([picture.flatten()[there] for picture in pictures]).cpu().numpy()
+    return median_depth, depth_std, alpha, np.arange(places.size).reshape(places.shape)

@@ -12,9 +12,9 @@ import numpy as np
 import poselib
 
 from gsfeatloc_ros.common.camera import Camera
-from gsfeatloc_ros.common.geometry import invert, make_pose, moved
+from gsfeatloc_ros.common.geometry import invert, make_pose
 from gsfeatloc_ros.common.parameter import parameter
-from gsfeatloc_ros.pose.linear import POSE_PARAMETERS, Linear, NormalEquations, linearize, normal_equations
+from gsfeatloc_ros.pose.linear import POSE_PARAMETERS, Linear, linearize, normal_equations
 from gsfeatloc_ros.pose.residual_field import ResidualField
 
 _MIN_ITERATIONS, _MAX_ITERATIONS = 200, 10_000
@@ -222,36 +222,20 @@ def refine_pose(
         residuals' scale, and the share of errors that the matches have in common.
         None where a point falls behind the camera or the matches do not determine the pose.
     """
-    pose = T_map_camera
-    damping = 1e-4
-    linear = linearize(camera, pose, found.points)
+    from gsfeatloc_ros.pose.descent import descend
+
+    pose, points = np.array(T_map_camera, np.float64), np.ascontiguousarray(found.points, np.float64)
+    pixels, scale = np.ascontiguousarray(found.pixels, np.float64), options.cauchy_scale
+    linear = linearize(camera, pose, points)
     if linear is None:
         return None
-    whitening = _whitening(linear.projected - found.pixels, _apply(linear.by_point, found.sigmas))
-
-    def with_cost(linear: Linear) -> tuple[NormalEquations, float]:
-        residuals = linear.projected - found.pixels
-        equations = normal_equations(whitening, residuals, linear.by_state, POSE_PARAMETERS, options.cauchy_scale)
-        return equations, float(np.log1p(equations.squared / options.cauchy_scale**2).sum())
-
-    equations, current = with_cost(linear)
-    for _ in range(_REFINE_ITERATIONS):
-        hessian = equations.hessian
-        try:
-            step = np.linalg.solve(hessian + damping * np.diag(np.diag(hessian)), -equations.gradient)
-        except np.linalg.LinAlgError:
-            return None
-        candidate = moved(pose, step)
-        linear_there = linearize(camera, candidate, found.points)
-        equations_there, cost_there = with_cost(linear_there) if linear_there else (equations, np.inf)
-        if linear_there is None or cost_there > current:
-            damping *= 10
-            continue
-        converged = current - cost_there <= _CONVERGED * current
-        pose, current, damping, linear, equations = candidate, cost_there, damping / 10, linear_there, equations_there
-        if converged:
-            break
-
+    whitening = _whitening(linear.projected - pixels, linear, found.sigmas)
+    if not descend(camera.K, pose, points, pixels, whitening, scale, _REFINE_ITERATIONS, _CONVERGED):
+        return None
+    linear = linearize(camera, pose, points)
+    assert linear is not None
+    residuals = linear.projected - pixels
+    equations = normal_equations(whitening, residuals, linear.by_state, POSE_PARAMETERS, scale)
     try:
         covariance = np.linalg.inv(equations.hessian)
     except np.linalg.LinAlgError:
@@ -263,7 +247,7 @@ def refine_pose(
     inflation = max((weights * equations.squared).sum() / degrees_of_freedom, 1.0)
     weighted = (weights[:, None, None] * by_pose).reshape(-1, POSE_PARAMETERS)
     information_of_a_match = weighted.T @ by_pose.reshape(-1, POSE_PARAMETERS) / weights.sum()
-    field = ResidualField.of(found.pixels, linear.projected - found.pixels, options.max_reprojection_error)
+    field = ResidualField.of(pixels, residuals, options.max_reprojection_error)
     shared = shared_variance(camera, field, options) * np.linalg.inv(information_of_a_match)
     return pose, covariance * inflation + shared
 
@@ -287,29 +271,12 @@ def whiten(
 ) -> np.ndarray | None:
     """Return matrices (M, 2, 2) that whiten residuals (M, 2) at a pose (4, 4); None with points that are not ahead."""
     linear = linearize(camera, T_map_camera, found.points)
-    return None if linear is None else _whitening(residuals, _apply(linear.by_point, found.sigmas))
+    return None if linear is None else _whitening(residuals, linear, found.sigmas)
 
 
-def _whitening(residuals: np.ndarray, smears: np.ndarray) -> np.ndarray:
-    """Matrices W (M, 2, 2) with W^T W the inverse covariances of the residuals (M, 2).
+def _whitening(residuals: np.ndarray, linear: Linear, sigmas: np.ndarray) -> np.ndarray:
+    """Return matrices (M, 2, 2) that whiten residuals (M, 2) of points of these `sigmas` (M, 3)."""
+    from gsfeatloc_ros.pose.kernels import whitening_matrices
 
-    A covariance is the smear (M, 2) of the point's uncertainty, in pixels, and the keypoints' noise, which is chosen so
-    that the median whitened residual is as long as a Gaussian's. W shortens what lies along the smear.
-    """
-    lengths, squares = (residuals**2).sum(axis=1), (smears**2).sum(axis=1)
-    along = (smears * residuals).sum(axis=1) ** 2
-    # Of a 2D Gaussian, the median of the squared length is 2 ln 2 variances.
-    noise = np.median(lengths) / (2 * np.log(2))
-    for _ in range(_NOISE_ITERATIONS):
-        noise = max(noise, _MIN_PIXEL_SIGMA**2)
-        # The squared whitened length times the noise, by the inverse of noise * I + smear smear^T.
-        noise = np.median(lengths - along / (noise + squares)) / (2 * np.log(2))
-    noise = max(noise, _MIN_PIXEL_SIGMA**2)
-    # The inverse square root of noise * I + smear smear^T.
-    shortened = (1.0 - np.sqrt(noise / (noise + squares))) / np.maximum(squares, np.finfo(float).tiny)
-    return (np.eye(2) - shortened[:, None, None] * (smears[:, :, None] * smears[:, None, :])) / np.sqrt(noise)
-
-
-def _apply(matrices: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-    """Each matrix (M, i, j) times its vector (M, j)."""
-    return np.einsum("mij,mj->mi", matrices, vectors)
+    sigmas = np.ascontiguousarray(sigmas, np.float64)
+    return whitening_matrices(residuals, linear.by_point, sigmas, _MIN_PIXEL_SIGMA, _NOISE_ITERATIONS)

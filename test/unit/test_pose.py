@@ -20,8 +20,9 @@ from gsfeatloc_ros.common.geometry import (
     transform,
     translation_error,
 )
+from gsfeatloc_ros.pose.descent import descend
 from gsfeatloc_ros.pose.lift import DEPTH_SIGMA_PER_STD, MAX_DEPTH_STD, LiftOptions, lift
-from gsfeatloc_ros.pose.linear import linearize
+from gsfeatloc_ros.pose.linear import linearize, normal_equations
 from gsfeatloc_ros.pose.residual_field import ResidualField
 from gsfeatloc_ros.pose.solve import (
     MIN_POINTS,
@@ -285,6 +286,40 @@ def test_refinement_refuses_points_behind_the_camera() -> None:
     found, _ = scene(0)
     found.points[0] = transform(POSE, np.array([[0, 0, -1.0]]))[0]
     assert refine_pose(CAMERA, POSE, found, PoseOptions()) is None
+
+
+def loss_at(pose: np.ndarray, found: Correspondences) -> tuple[float, np.ndarray]:
+    """Cauchy's loss of residuals, not whitened, and how far (6,) it is from the least, in standard deviations."""
+    linear = linearize(CAMERA, pose, found.points)
+    whitening = np.tile(np.eye(2), (len(found.pixels), 1, 1))
+    equations = normal_equations(whitening, linear.projected - found.pixels, linear.by_state, 6, 1.0)
+    covariance = np.linalg.inv(equations.hessian)
+    return np.log1p(equations.squared).sum(), covariance @ equations.gradient / np.sqrt(np.diag(covariance))
+
+
+@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("off", [1e-9, 0.01, 0.2])
+def test_descends_to_where_the_loss_is_least(seed: int, off: float) -> None:
+    found, _ = scene(seed, noise=0.7)
+    start = moved(POSE, off * np.random.default_rng(seed).normal(size=6))
+    pose, whitening = start.copy(), np.tile(np.eye(2), (len(found.pixels), 1, 1))
+    assert descend(CAMERA.K, pose, found.points, found.pixels, whitening, 1.0, 100, 1e-9)
+    loss, step = loss_at(pose, found)
+    assert loss <= loss_at(start, found)[0]
+    np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-12)
+    assert np.abs(step).max() < 1e-2
+    # A few steps go there by and by; none leads up.
+    losses, pose = [], start.copy()
+    for _ in range(3):
+        descend(CAMERA.K, pose, found.points, found.pixels, whitening, 1.0, 1, 0.0)
+        losses.append(loss_at(pose, found)[0])
+    assert losses == sorted(losses, reverse=True)
+
+
+def test_where_any_pose_will_do_there_is_no_descent() -> None:
+    found, _ = scene(0)
+    nothing_known = np.zeros((len(found.pixels), 2, 2))
+    assert not descend(CAMERA.K, POSE.copy(), found.points, found.pixels, nothing_known, 1.0, 20, 1e-7)
 
 
 def test_near_the_pose_it_is_solved_for_without_sampling() -> None:
