@@ -10,8 +10,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 _PROC, _CGROUPS = Path("/proc"), Path("/sys/fs/cgroup")
-# Of glibc's mallopt(3): what is set, and to how many bytes. The pictures of a localization take 10 to 30 MB in all, each
-# at most 4 MB: images of 1080p, of which requests may bring many, are larger, and go back at once.
+# Of glibc's mallopt(3): what is set, and to how many bytes. The pictures of a localization take 10 to 30 MB in all,
+# each at most 4 MB: images of 1080p, of which requests may bring many, are larger, and go back at once.
 _KEPT_MEMORY = {"TRIM_THRESHOLD": (-1, 32 * 2**20), "MMAP_THRESHOLD": (-3, 5 * 2**20)}
 
 

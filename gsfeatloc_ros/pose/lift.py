@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsfeatloc_ros.common.arrays import to_device
+from gsfeatloc_ros.common.arrays import to_device, to_host
 from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.geometry import transform
 from gsfeatloc_ros.render.base import Render
@@ -74,7 +74,7 @@ def _on_host(render: Render, places: np.ndarray) -> tuple[np.ndarray, np.ndarray
     """Median depth, its spread and alpha, flat, with places (M, 4) in them where they are as at these in the render."""
     pictures = (render.median_depth, render.depth_std, render.alpha)
     if isinstance(render.alpha, np.ndarray):
-        median_depth, depth_std, alpha = (picture.ravel() for picture in pictures)
+        median_depth, depth_std, alpha = (to_host(picture).ravel() for picture in pictures)
         return median_depth, depth_std, alpha, places
     import torch
 
