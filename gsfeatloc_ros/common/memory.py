@@ -1,32 +1,13 @@
-"""How much memory is left: of the machine, of the container or service, of the process; and what is kept of it."""
+"""How much memory is left: of the machine, of the container or service, of the process."""
 
 from __future__ import annotations
 
 import contextlib
-import ctypes
-import os
 import resource
 from collections.abc import Iterator
 from pathlib import Path
 
 _PROC, _CGROUPS = Path("/proc"), Path("/sys/fs/cgroup")
-# Of glibc's mallopt(3): what is set, and to how many bytes. The pictures of a localization take 10 to 30 MB in all,
-# each at most 4 MB: images of 1080p, of which requests may bring many, are larger, and go back at once.
-_KEPT_MEMORY = {"TRIM_THRESHOLD": (-1, 32 * 2**20), "MMAP_THRESHOLD": (-3, 5 * 2**20)}
-
-
-def keep_freed_memory() -> None:
-    """Let the C library (glibc) keep the memory of pictures that are gone for the next ones, up to 32 MB of it.
-
-    Given back to the system it would come anew page by page, each of them zeroed: that took 4 ms of a localization of
-    56, and 10 of one of 95. Where the environment sets one of these limits (MALLOC_TRIM_THRESHOLD_, GLIBC_TUNABLES),
-    all stays as it is.
-    """
-    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
-    chosen = "GLIBC_TUNABLES" in os.environ or any(f"MALLOC_{name}_" in os.environ for name in _KEPT_MEMORY)
-    if mallopt and not chosen:
-        for option, size in _KEPT_MEMORY.values():
-            mallopt(option, size)
 
 
 def available_memory(proc: Path = _PROC, cgroups: Path = _CGROUPS) -> int:

@@ -7,6 +7,7 @@ import sys
 import time
 from typing import TYPE_CHECKING
 
+from gsfeatloc_ros.common.malloc import tune_malloc
 from gsfeatloc_ros.common.threads import wait_passively
 from gsfeatloc_ros.common.words import in_one_line
 from gsfeatloc_ros.node.environment import check_environment
@@ -29,8 +30,9 @@ def main(args: list[str] | None = None) -> int:
 
     Where it cannot start, return 1; where it cannot go on, end the process with that. The last line says why.
     """
-    # Before the imports below: they load OpenMP.
+    # Before the imports below, which load OpenMP, and before the threads of the middleware.
     wait_passively()
+    tune_malloc()
     stop, systemd = Stop(), Systemd()
     try:
         check_environment()

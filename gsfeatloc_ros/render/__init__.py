@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from gsfeatloc_ros.common.device import DEVICES, choose_device, device_without
-from gsfeatloc_ros.common.memory import keep_freed_memory
+from gsfeatloc_ros.common.malloc import tune_malloc
 from gsfeatloc_ros.common.threads import wait_passively
 from gsfeatloc_ros.maps.gaussian_map import GaussianMap
 from gsfeatloc_ros.render.base import DEFAULT_DRAW_OPTIONS, DrawOptions, Render, Renderer, SplatRenderer, StaleMapError
@@ -36,7 +36,7 @@ def create_renderer(
         RuntimeError: device "cuda" cannot be used; the message says what is missing and what to do.
     """
     wait_passively()
-    keep_freed_memory()
+    tune_malloc()
     # Imported here: numba and torch take a second each, and users of the protocol alone do not need them.
     if choose_device(device) == "cuda":
         from gsfeatloc_ros.render.gpu import GpuRenderer, self_check

@@ -1,8 +1,7 @@
-"""How much memory is left, and what is kept of it."""
+"""How much memory is left."""
 
 from __future__ import annotations
 
-import os
 import resource
 import subprocess
 import sys
@@ -14,26 +13,6 @@ import gsfeatloc_ros
 from gsfeatloc_ros.common.memory import available_memory
 
 GB = 10**9
-# Pictures of localizations, made and dropped again and again in a thread, as the node's worker does; prints how many
-# pages were taken from the system for it.
-PICTURES = """
-import contextlib, resource, threading
-import numpy as np
-from gsfeatloc_ros.render import create_renderer
-with contextlib.suppress(ValueError):
-    create_renderer(None, device="none")
-def localize():
-    pictures = [np.ones((480, 640), np.float32) for _ in range(16)]
-def work():
-    localize()
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-    for _ in range(10):
-        localize()
-    print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
-thread = threading.Thread(target=work)
-thread.start()
-thread.join()
-"""
 
 
 @pytest.fixture
@@ -87,15 +66,3 @@ print(left, left - available_memory())
 def test_without_proc_there_is_no_limit(tmp_path):
     if resource.getrlimit(resource.RLIMIT_AS)[0] == resource.RLIM_INFINITY:
         assert available_memory(tmp_path, tmp_path) > 2**50
-
-
-@pytest.mark.parametrize(
-    ("chosen", "kept"), [({}, True), ({"MALLOC_TRIM_THRESHOLD_": "0"}, False), ({"MALLOC_MMAP_THRESHOLD_": "1"}, False)]
-)
-def test_freed_pictures_are_kept_from_the_first_renderer_on_unless_the_user_says_otherwise(chosen, kept):
-    environment = {name: value for name, value in os.environ.items() if not name.startswith("MALLOC_")}
-    package = Path(gsfeatloc_ros.__file__).parents[1]
-    command, environment = [sys.executable, "-c", PICTURES], environment | chosen
-    finished = subprocess.run(command, cwd=package, env=environment, capture_output=True, text=True, check=True)
-    # 10 times 16 pictures are 48,000 pages.
-    assert (int(finished.stdout) < 500) == kept
