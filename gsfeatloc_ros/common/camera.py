@@ -11,6 +11,8 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
+from gsfeatloc_ros.common.shrink import shrunk
+
 # OpenCV's models behind the names that sensor_msgs/CameraInfo gives them, with the numbers of coefficients they take.
 _COEFFICIENTS = {"plumb_bob": (0, 4, 5), "rational_polynomial": (0, 8, 12, 14), "equidistant": (0, 4)}
 
@@ -89,7 +91,7 @@ class Camera:
     def limit(self, image: np.ndarray, max_width: int) -> tuple[np.ndarray, Camera]:
         """Resize an image (H, W, C) of this camera to at most `max_width` pixels of width, with its camera."""
         camera = self.limited(max_width)
-        return cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA), camera
+        return shrunk(image, camera.width, camera.height), camera
 
     def enlarged(self, focal_length: float, max_side: int) -> Camera:
         """Return the camera of the image enlarged, in proportion, to a focal length, neither side beyond `max_side`."""

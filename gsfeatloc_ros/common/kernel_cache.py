@@ -28,7 +28,7 @@ def set_kernel_cache() -> None:
     $XDG_CACHE_HOME/gsfeatloc_ros/numba or ~/.cache/gsfeatloc_ros/numba. It is this user's alone. NUMBA_CACHE_DIR is it
     from then on, also in the processes that this one starts.
     """
-    name = f"kernels-{hash_of_sources('match', 'pose', 'render')[:16]}"
+    name = f"kernels-{hash_of_sources('common', 'match', 'pose', 'render')[:16]}"
     chosen = os.environ.get("NUMBA_CACHE_DIR")
     # Processes inherit it from those that start them.
     roots = [Path(chosen).parent if Path(chosen).name == name else Path(chosen)] if chosen else _usual_roots()

@@ -13,6 +13,7 @@ from gsfeatloc_ros.common.arrays import to_host
 from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.local_structure import local_structure
 from gsfeatloc_ros.common.photo import Photo
+from gsfeatloc_ros.common.shrink import shrunk
 from gsfeatloc_ros.localize.query import MatchedView, Query
 from gsfeatloc_ros.pose.solve import Correspondences
 
@@ -162,9 +163,10 @@ def _structures(photo: Photo, view: MatchedView) -> tuple[np.ndarray, np.ndarray
     scale = min(1.0, _FOCAL_LENGTH / camera.K[0, 0])
     size = (max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
     covered = photo.seen & (to_host(view.render.alpha) >= _MIN_ALPHA)
-    covered = cv2.resize(covered.astype(np.float32), size, interpolation=cv2.INTER_AREA) > _MIN_COVERED
+    # As bytes, of which that is a whole number.
+    covered = shrunk(covered * np.uint8(200), *size) > 200 * _MIN_COVERED
     (photo_structure, photo_contrast), (map_structure, map_contrast) = (
-        local_structure(cv2.resize(gray, size, interpolation=cv2.INTER_AREA), _NEIGHBOURHOOD, _MIN_CONTRAST)
+        local_structure(shrunk(gray, *size), _NEIGHBOURHOOD, _MIN_CONTRAST)
         for gray in (photo.gray(), cv2.cvtColor(to_host(view.image), cv2.COLOR_RGB2GRAY))
     )
     compared = covered & (np.maximum(photo_contrast, map_contrast) >= _MIN_CONTRAST)
@@ -174,15 +176,16 @@ def _structures(photo: Photo, view: MatchedView) -> tuple[np.ndarray, np.ndarray
 def _correlation(photo: Photo, view: MatchedView) -> np.ndarray:
     """Return the correlation (12, 16) of photo and render in each cell; NaN where there is nothing to compare."""
     a, b, compared, covered = _structures(photo, view)
-    height, width = a.shape
-    across, down = CELLS
-    rows, columns = np.arange(height) * down // height, np.arange(width) * across // width
-    cells = (rows[:, None] * across + columns)[covered]
+    a, b = (np.where(covered, structure, np.float32(0)) for structure in (a, b))
+    (height, width), (across, down) = a.shape, CELLS
+    # Where rows are of a row of cells, and columns of a column.
+    rows = np.arange(down)[:, None] == np.arange(height) * down // height
+    columns = (np.arange(width) * across // width)[:, None] == np.arange(across)
 
     def total(values: np.ndarray) -> np.ndarray:
-        return np.bincount(cells, values[covered], across * down)
+        return (rows.astype(np.float32) @ values.astype(np.float32) @ columns.astype(np.float32)).astype(np.float64)
 
-    area, covered_area = height * width / (across * down), total(np.ones_like(a))
+    area, covered_area = height * width / (across * down), total(covered)
     enough = (covered_area >= _MIN_COVERED_SHARE * area) & (total(compared) >= _MIN_CONTRAST_SHARE * covered_area)
     correlation = total(a * b) / np.sqrt(np.maximum(total(a * a) * total(b * b), np.finfo(np.float64).tiny))
-    return np.where(enough & (covered_area > 0), correlation, np.nan).reshape(down, across)
+    return np.where(enough & (covered_area > 0), correlation, np.nan)

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from gsfeatloc_ros.common.kernels import njit
-from gsfeatloc_ros.render.lanes import LANES, bits_of_float, load, lowest_bit, mask_bits, maximum, sqrt, store
+from gsfeatloc_ros.common.lanes import LANES, bits_of_float, load, lowest_bit, mask_bits, maximum, sqrt, store
 
 # How many pixels corners are apart, of what part of the strongest one's strength, and over a block of how many pixels a
 # side that is measured.

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from gsfeatloc_ros.common.kernels import njit
-from gsfeatloc_ros.render.lanes import LANES, broadcast, load, store, total
+from gsfeatloc_ros.common.lanes import LANES, broadcast, load, store, total
 
 WINDOW = 15
 """Pixels across and down the windows that are compared."""

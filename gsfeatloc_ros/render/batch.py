@@ -9,8 +9,7 @@ import math
 import numpy as np
 
 from gsfeatloc_ros.common.kernels import njit
-from gsfeatloc_ros.render import base
-from gsfeatloc_ros.render.lanes import (
+from gsfeatloc_ros.common.lanes import (
     LANES,
     SQUARE,
     absolute,
@@ -20,6 +19,7 @@ from gsfeatloc_ros.render.lanes import (
     store,
     store_rows,
 )
+from gsfeatloc_ros.render import base
 from gsfeatloc_ros.render.project import (
     BOTTOM,
     CONIC_X,

@@ -11,10 +11,7 @@ from llvmlite import ir
 from numba import types
 
 from gsfeatloc_ros.common.kernels import intrinsic, njit, prange
-from gsfeatloc_ros.render import base
-from gsfeatloc_ros.render.batch import BATCH_ROWS, BATCH_SIZE, BLOCKS, BLOCKS_X, DEPTH2, load_batch, record
-from gsfeatloc_ros.render.depth_sort import sorted_by_depth
-from gsfeatloc_ros.render.lanes import (
+from gsfeatloc_ros.common.lanes import (
     LANES,
     SQUARE,
     broadcast,
@@ -33,6 +30,9 @@ from gsfeatloc_ros.render.lanes import (
     store_rows,
     store_square,
 )
+from gsfeatloc_ros.render import base
+from gsfeatloc_ros.render.batch import BATCH_ROWS, BATCH_SIZE, BLOCKS, BLOCKS_X, DEPTH2, load_batch, record
+from gsfeatloc_ros.render.depth_sort import sorted_by_depth
 from gsfeatloc_ros.render.project import BLUE, CONIC_X, CONIC_Y, DEPTH, GREEN, LOG_OPACITY, RED, SLANT, TILE, X, Y
 
 # State of a block's pixels. Depths count from the tile's nearest splat: the spread is a difference of squares.

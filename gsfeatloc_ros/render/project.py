@@ -9,8 +9,7 @@ import math
 import numpy as np
 
 from gsfeatloc_ros.common.kernels import njit, prange
-from gsfeatloc_ros.render import base, prepare
-from gsfeatloc_ros.render.lanes import (
+from gsfeatloc_ros.common.lanes import (
     LANES,
     bits_of_float,
     broadcast,
@@ -26,6 +25,7 @@ from gsfeatloc_ros.render.lanes import (
     store_columns,
     whole,
 )
+from gsfeatloc_ros.render import base, prepare
 from gsfeatloc_ros.render.prepare import CHUNK
 
 TILE = 16

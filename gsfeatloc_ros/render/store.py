@@ -9,8 +9,8 @@ import math
 import numpy as np
 
 from gsfeatloc_ros.common.kernels import njit
+from gsfeatloc_ros.common.lanes import bits_of_float
 from gsfeatloc_ros.render.chunks import COV_XX, COV_YY, COV_ZZ, MEAN_X
-from gsfeatloc_ros.render.lanes import bits_of_float
 
 _MIN_HALF, _MAX_HALF = np.float32(2.0**-14), np.float32(65504)
 

@@ -16,13 +16,13 @@ from hypothesis import strategies as st
 from small_maps import assert_same, concatenated, one_gaussian, psnr, random_map, small_camera
 
 from gsfeatloc_ros import render as renderers
+from gsfeatloc_ros.common import lanes as simd
 from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.geometry import make_pose, so3_exp, transform
 from gsfeatloc_ros.maps import GaussianMap, load_map
 from gsfeatloc_ros.maps.gaussian_map import SH_COEFFICIENTS
 from gsfeatloc_ros.maps.ply import write_ply
 from gsfeatloc_ros.render import DrawOptions, Render
-from gsfeatloc_ros.render import lanes as simd
 from gsfeatloc_ros.render.base import DEPTH_MIN_ALPHA, MIN_ALPHA
 from gsfeatloc_ros.render.enlarge import enlarge
 from gsfeatloc_ros.render.prepare import CHUNK, prepare

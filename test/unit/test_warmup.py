@@ -117,11 +117,11 @@ def test_kernels_are_kept_below_what_the_user_set_and_once_only(unwritable_insta
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("source", ["base.py", "lanes.py", "blend.py"])
+@pytest.mark.parametrize("source", ["common/lanes.py", "match/flow.py", "render/base.py"])
 def test_kernels_of_other_sources_are_kept_apart(unwritable_install, tmp_path, source):
     where = {"NUMBA_CACHE_DIR": str(tmp_path)}
     before = cache_dir(unwritable_install, **where)
-    with (unwritable_install / "gsfeatloc_ros" / "render" / source).open("a") as file:
+    with (unwritable_install / "gsfeatloc_ros" / source).open("a") as file:
         file.write("# changed\n")
     assert cache_dir(unwritable_install, **where) != before
 

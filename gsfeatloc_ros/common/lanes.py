@@ -24,6 +24,7 @@ SQUARE = 4
 
 _FLOATS = ir.VectorType(ir.FloatType(), LANES)
 _DOUBLES = ir.VectorType(ir.DoubleType(), LANES)
+_BYTES = ir.VectorType(ir.IntType(8), LANES)
 _SHORTS = ir.VectorType(ir.IntType(16), LANES)
 _INTS = ir.VectorType(ir.IntType(32), LANES)
 _BITS = ir.VectorType(ir.IntType(1), LANES)
@@ -132,6 +133,17 @@ def load(typingctx, array, index):
     def codegen(context, builder, sig, args):
         data = _data(context, builder, sig.args[0], args[0])
         return builder.load(_vector_at(builder, data, args[1], _FLOATS), align=4)
+
+    return _LANES(array, types.intp), codegen
+
+
+@intrinsic
+def load_bytes(typingctx, array, index):
+    """Do as `load` with a uint8 array."""
+
+    def codegen(context, builder, sig, args):
+        data = _data(context, builder, sig.args[0], args[0])
+        return builder.uitofp(builder.load(_vector_at(builder, data, args[1], _BYTES), align=1), _FLOATS)
 
     return _LANES(array, types.intp), codegen
 
