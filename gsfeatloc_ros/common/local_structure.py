@@ -20,27 +20,26 @@ def local_structure(gray: np.ndarray, neighbourhood: float, min_contrast: float)
     Returns:
         The structure (H, W) float32, and the local standard deviation (H, W) float32.
     """
+    # Not before the first: numba takes a second to load, and makes a folder.
+    from gsfeatloc_ros.common.block_kernels import centre, divide, mean_rows
+
     height, width = gray.shape
     factor = max(1, int(neighbourhood / _SIGMA))
-    # Whole blocks of pixels are averaged: that is several times faster than shares of them. Pictures are written over:
-    # new ones cost more than what is computed.
+    sigma = neighbourhood / factor
     gray = cv2.copyMakeBorder(gray, 0, -height % factor, 0, -width % factor, cv2.BORDER_REPLICATE)
-    centred = gray.astype(np.float32)
-    mean = _enlarged(_smooth(centred, factor, neighbourhood), factor)
-    centred -= mean
-    squared = np.multiply(centred, centred, out=mean)
-    contrast = _enlarged(np.sqrt(_smooth(squared, factor, neighbourhood)), factor)
-    centred /= np.maximum(contrast, min_contrast, out=squared)
-    return centred[:height, :width], contrast[:height, :width]
+    structure, squares = centre(gray, _widened(_smooth(mean_rows(gray, factor), factor, sigma), factor), factor)
+    deviations = _widened(np.sqrt(_smooth(squares, factor, sigma)), factor)
+    contrast = divide(structure, deviations, factor, np.float32(min_contrast))
+    return structure[:height, :width], contrast[:height, :width]
 
 
-def _smooth(picture: np.ndarray, factor: int, sigma: float) -> np.ndarray:
-    """Return a picture smoothed by a Gaussian window of `sigma` pixels, in blocks of `factor` x `factor` pixels."""
-    height, width = picture.shape
-    blocks = cv2.resize(picture, (width // factor, height // factor), interpolation=cv2.INTER_AREA)
-    return cv2.GaussianBlur(blocks, (0, 0), sigma / factor)
+def _smooth(rows: np.ndarray, factor: int, sigma: float) -> np.ndarray:
+    """Return the means (h, w) of `factor` columns of rows (h, factor w), smoothed by a Gaussian window of `sigma`."""
+    height, width = rows.shape
+    return cv2.GaussianBlur(cv2.resize(rows, (width // factor, height), interpolation=cv2.INTER_AREA), (0, 0), sigma)
 
 
-def _enlarged(blocks: np.ndarray, factor: int) -> np.ndarray:
+def _widened(blocks: np.ndarray, factor: int) -> np.ndarray:
+    """Return blocks (h, w) interpolated to rows (h, factor w)."""
     height, width = blocks.shape
-    return cv2.resize(blocks, (width * factor, height * factor), interpolation=cv2.INTER_LINEAR)
+    return cv2.resize(blocks, (factor * width, height), interpolation=cv2.INTER_LINEAR)
