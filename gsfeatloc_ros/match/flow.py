@@ -25,6 +25,8 @@ _STRIDE = LANES + 2
 # which the last is not used.
 _WINDOW_SIZE = WINDOW * LANES
 _HALF = np.float32((WINDOW - 1) / 2)
+# Of a level, that of the next smaller one.
+_HALF_SIZE = np.float32(0.5)
 # A window may stick out wholly, and needs a pixel more for its gradients and another between pixels.
 _BORDER = LANES + 2
 # Iterations end after so many, with a step no longer than this, or where they turn to and fro.
@@ -64,19 +66,23 @@ def flow(here: Pyramid, there: Pyramid, pixels: np.ndarray) -> tuple[np.ndarray,
     sizes = here.levels[0].shape, there.levels[0].shape
     if sizes[0] != sizes[1]:
         raise ValueError(f"pictures of different sizes: {sizes[0]} and {sizes[1]} with their borders")
-    moved, found = np.zeros((len(pixels), 2), np.float32), np.ones(len(pixels), np.bool_)
-    shift = np.zeros((len(pixels), 2), np.float32)
-    for level in reversed(range(len(here.levels))):
-        corners = (pixels / 2**level).astype(np.float32)
-        moved = corners + 2 * shift
-        _follow(here.levels[level], there.levels[level], corners, moved, found)
-        shift = moved - corners
+    pixels, levels = np.ascontiguousarray(pixels, np.float32), len(here.levels)
+    moved, found = pixels / np.float32(2**levels), np.ones(len(pixels), np.bool_)
+    for level in reversed(range(levels)):
+        _follow(here.levels[level], there.levels[level], pixels, np.float32(0.5**level), moved, found)
     return moved, found
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _follow(here, there, corners, moved, found):
-    """Move the guesses `moved` (N, 2) to where the windows of a level's corners are in another, and say which are."""
+def _follow(here, there, pixels, size, moved, found):
+    """Find where the windows of pixels (N, 2) of a picture are in another, on a level of `size` times its width.
+
+    Args:
+        here, there: the level of both.
+        pixels, size: as above.
+        moved: (N, 2) where they are on the next smaller level; on this one when it is done.
+        found: (N,) bool, written: which they are.
+    """
     # Kernels below take flat arrays and numbers alone: numba counts who uses an array, which takes longer than they do.
     height, stride = here.shape[0] - 2 * _BORDER, here.shape[1]
     width = stride - 2 * _BORDER
@@ -84,10 +90,13 @@ def _follow(here, there, corners, moved, found):
     patch = np.empty((WINDOW + 2) * _STRIDE, np.float32)
     window = np.empty(3 * _WINDOW_SIZE, np.float32)
     used = np.empty(LANES, np.float32)
-    for corner in range(len(corners)):
+    for corner in range(len(pixels)):
         found[corner] = False
+        x, y = size * pixels[corner, 0], size * pixels[corner, 1]
+        moved[corner, 0] = x + 2 * (moved[corner, 0] - _HALF_SIZE * x)
+        moved[corner, 1] = y + 2 * (moved[corner, 1] - _HALF_SIZE * y)
         # Where its window begins.
-        x, y = corners[corner, 0] - _HALF, corners[corner, 1] - _HALF
+        x, y = x - _HALF, y - _HALF
         if not _is_inside(x, y, width, height):
             continue
         _cut_out(here, stride, x, y, patch)
