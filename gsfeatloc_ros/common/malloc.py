@@ -27,3 +27,10 @@ def tune_malloc() -> None:
     if mallopt and not os.environ.keys() & {"GLIBC_TUNABLES", *_OPTIONS}:
         for option, value in _OPTIONS.values():
             mallopt(option, value)
+
+
+def give_back_memory() -> None:
+    """Give the system what was freed between what is still used: of a flood of requests, of maps that were loaded."""
+    malloc_trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if malloc_trim:
+        malloc_trim(0)

@@ -8,6 +8,7 @@ from dataclasses import replace
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
+from gsfeatloc_ros.common.malloc import give_back_memory
 from gsfeatloc_ros.common.threads import Cores
 from gsfeatloc_ros.localize.engine import Engine
 from gsfeatloc_ros.localize.settings import MapSettings
@@ -31,10 +32,11 @@ from gsfeatloc_ros.ros_io.settings import CONTINUOUS, ON_REQUEST, Settings
 from gsfeatloc_ros.ros_io.state import LocalizationState, State
 
 # Seconds between two reports on the node's health, as of diagnostic_updater, between two looks for requests that have
-# waited too long, and between two saves of the last pose.
+# waited too long, between two saves of the last pose, and until memory that is not used any more is given back.
 _HEALTH_PERIOD = 1.0
 _LATE_PERIOD = 0.2
 _SAVE_PERIOD = 5.0
+_MEMORY_PERIOD = 20.0
 
 
 class Session:
@@ -107,6 +109,7 @@ class Session:
             node.create_timer(_HEALTH_PERIOD, self._report_health, clock=steady),
             node.create_timer(_LATE_PERIOD, self.attempts.drop_late, clock=steady),
             node.create_timer(_SAVE_PERIOD, self._pose_file.save, clock=steady),
+            node.create_timer(_MEMORY_PERIOD, give_back_memory, clock=steady),
         ]
         self.use_settings(settings)
         self._tell_reading()

@@ -52,6 +52,20 @@ libc.malloc_info(0, ctypes.c_void_p(stream))
 libc.fflush(None)
 """
 
+# Every other one of many small pieces is freed; prints what part of the memory is held then, and once it is given back.
+PIECES = """
+from gsfeatloc_ros.common.malloc import give_back_memory
+def resident():
+    return int(open("/proc/self/statm").read().split()[1])
+before = resident()
+pieces = [bytes(200_000) for _ in range(1000)]
+most = resident() - before
+pieces[::2] = [b""] * 500
+freed = resident() - before
+give_back_memory()
+print(freed / most, (resident() - before) / most)
+"""
+
 environments = pytest.mark.parametrize(
     ("chosen", "tuned"),
     [({}, True), ({"MALLOC_TRIM_THRESHOLD_": "0"}, False), ({"MALLOC_MMAP_THRESHOLD_": "1"}, False)],
@@ -75,3 +89,9 @@ def test_freed_pictures_are_kept_unless_the_user_says_otherwise(chosen, tuned):
 @environments
 def test_they_are_kept_once_and_not_for_each_thread(chosen, tuned):
     assert (printed(THREADS, chosen).count("<heap nr=") <= 2) == tuned
+
+
+def test_what_was_freed_between_what_is_used_is_given_back():
+    freed, given_back = map(float, printed(PIECES, {}).split())
+    assert freed > 0.9
+    assert given_back < 0.6
