@@ -139,7 +139,7 @@ class CpuSettings:
 
     threads: int = parameter(
         0,
-        "Threads that compute at most: of numba, OpenMP (torch, faiss), OpenCV and BLAS; 0 takes all cores.",
+        "Threads that compute at most: of numba, OpenMP (torch, faiss) and OpenCV; 0 takes all cores.",
         (0, 1024),
     )
 
