@@ -8,6 +8,7 @@ import signal
 import socket
 import sys
 import threading
+from contextlib import suppress
 from types import FrameType
 from typing import NoReturn
 
@@ -58,6 +59,8 @@ class Stop:
 
 def leave(status: int) -> NoReturn:
     """End the process at once: threads may be in native code that the interpreter's own exit would pull away."""
-    sys.stdout.flush()
-    sys.stderr.flush()
+    for stream in (sys.stdout, sys.stderr):
+        # What a signal interrupted in the middle of writing, or nobody reads any more, is lost.
+        with suppress(RuntimeError, OSError):
+            stream.flush()
     os._exit(status)

@@ -28,7 +28,7 @@ RAW, COMPRESSED = "raw", "compressed"
 _log = logging.getLogger(__name__)
 
 _POLICY = PriorPolicy()
-_ONCE_PLACED = "set it to true once map.scale, map.translation and map.rotation put the map where"
+_PLACED = "map.scale, map.translation and map.rotation put the map where"
 
 
 @dataclass(frozen=True)
@@ -213,17 +213,19 @@ class Settings:
         """Raise ValueError where something is asked for that needs a map which lies where the robot's map frame is."""
         if self.node.answer_frames().odom and not self.map.aligned:
             raise ValueError(
-                f"publish_tf needs map.aligned: {_ONCE_PLACED} the robot's map frame is; other nodes would believe a "
-                "pose that is off"
+                f"publish_tf needs map.aligned: set it to true once {_PLACED} the robot's map frame is; other nodes "
+                "would believe a pose that is off"
             )
         self.check_plane()
 
     def check_plane(self) -> None:
         """Raise ValueError where something is asked for that needs a map whose floor is known to be z = 0."""
-        planar = {"search.planar": self.recovery.planar, "index.camera_height": self.index.on_plane}
-        for name, asked in planar.items():
-            if asked and not self.map.aligned:
-                raise ValueError(f"{name} needs map.aligned: {_ONCE_PLACED} the floor is z = 0")
+        if self.map.aligned:
+            return
+        if self.recovery.planar:
+            raise ValueError(f"search.planar needs map.aligned: set it to true once {_PLACED} the floor is z = 0")
+        if self.index.on_plane:
+            raise ValueError(f"index.camera_height needs map.aligned: set it to true once {_PLACED} the floor is z = 0")
 
     def prior_policy(self) -> PriorPolicy:
         """Return what priors are worth."""

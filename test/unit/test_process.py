@@ -139,6 +139,35 @@ if sys.argv[1] == "hangs":
 """
 
 
+# A signal that comes while the log is written, and a log that nobody reads any more.
+INTERRUPTED = """
+import io, sys
+from gsfeatloc_ros.node.stop import leave
+class Interrupted(io.RawIOBase):
+    def writable(self):
+        return True
+    def write(self, data):
+        leave(0)
+sys.stdout = io.TextIOWrapper(io.BufferedWriter(Interrupted()))
+print("half of a line", flush=True)
+"""
+UNREAD = """
+import os, sys
+from gsfeatloc_ros.node.stop import leave
+reading, writing = os.pipe()
+os.close(reading)
+sys.stdout = open(writing, "w")
+print("a line")
+leave(0)
+"""
+
+
+@pytest.mark.parametrize("script", [INTERRUPTED, UNREAD])
+def test_a_log_that_cannot_be_written_does_not_change_how_it_ends(script):
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, timeout=TIMEOUT)
+    assert (done.returncode, done.stderr) == (0, b"")
+
+
 @pytest.mark.parametrize(
     ("where", "status", "says"),
     [
