@@ -136,9 +136,9 @@ class LiveNode(ClientNode):
             self._parameters.call_async(request).add_done_callback(self._on_parameters)
 
     def _on_parameters(self, answer: Future) -> None:
-        (value,) = answer.result().values
-        self._prior_frame = value.string_value
-        self._add_waiting()
+        self._prior_frame = answer.result().values[0].string_value
+        with contextlib.suppress(ValueError):
+            self._add_waiting()
 
     def _on_camera_info(self, message: CameraInfo) -> None:
         self._camera_frame = message.header.frame_id

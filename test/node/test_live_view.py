@@ -93,13 +93,17 @@ def test_an_attempt_is_put_together_of_all_that_a_node_says_of_it(live, robot):
 
 @pytest.mark.parametrize("prior_frame", ["camera", "base"])
 def test_a_prior_is_drawn_of_what_the_node_takes_it_for(live, robot, prior_frame):
-    from geometry_msgs.msg import PoseStamped
+    from geometry_msgs.msg import Pose, PoseStamped, Quaternion
     from rclpy.parameter import Parameter
+    from std_msgs.msg import Header
 
     _, store = live
     robot.node.set_parameters([Parameter("prior_frame", value=prior_frame)])
-    # It may come before the node has said so.
-    publisher(robot, PoseStamped, "/robot/prior").publish(pose_stamped(POSE))
+    # It may come before the node has said so; a pose that is none, too.
+    priors = publisher(robot, PoseStamped, "/robot/prior")
+    priors.publish(PoseStamped(header=Header(frame_id="map"), pose=Pose(orientation=Quaternion(w=0.0))))
+    robot.spin(3.0)
+    priors.publish(pose_stamped(POSE))
     assert robot.spin_until(lambda: store.newest_prior is not None, 30)
     np.testing.assert_allclose(store.newest_prior.pose, POSE)
     assert store.newest_prior.of_base == (prior_frame == "base")
