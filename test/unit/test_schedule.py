@@ -43,8 +43,9 @@ def due_images(camera_rate, max_rate, count, jitter, seed=0):
     return [number for number, stamp in enumerate(stamps.tolist()) if schedule.is_due(stamp)]
 
 
-@given(st.floats(29.9, 30.1), st.floats(0.0, 0.2), st.integers(0, 1000))
+@given(st.floats(29.9, 30.1), st.floats(0.0, 0.15), st.integers(0, 1000))
 def test_of_a_camera_at_30_hz_and_10_at_most_every_third_image_is_due(camera_rate, jitter, seed):
+    """Turns settle up to a quarter of a step beside the images: with more jitter another may be within half a step."""
     due = due_images(camera_rate, 10.0, 400, jitter, seed)
     assert due == list(range(0, 400, 3))
 
