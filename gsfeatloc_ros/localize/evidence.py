@@ -28,6 +28,9 @@ _MIRRORED = 1e-4
 _MAX_CHANGED = 0.7
 _MAX_CHANGED_WITHOUT_PRIOR = 0.4
 _MAX_CHANGED_FAR_FROM_PRIOR = 0.15
+# Who looks the same way and has been turned by more than this many degrees about the optical axis was no robot: a
+# picture of the place, upside down, was held before the camera.
+_MAX_ROLL_FAR_FROM_PRIOR = 90.0
 # What covers the photo is seldom found in the render. By a wrong calibration a part of the photo fits, and the rest is
 # found beside where it should be: at least this share of the corners that are found agree.
 _MIN_INLIER_RATIO = 0.8
@@ -63,6 +66,7 @@ class Evidence:
         changed: share of the photo in which it shows something else than the map.
         reprojection_error_px: RMS of the inliers' reprojection errors in pixels of the localized photo.
         deviation: distance of the pose from the prior in standard deviations of the prior.
+        roll_deg: by how many degrees the pose is turned about the optical axis against a prior that looks the same way.
         blur_px: extent of the photo's blur in pixels of the localized photo; 0 for a sharp one.
         bend_px: error in pixels that the covariance allows for, because the corners are off in a smooth pattern that no
             pose and no camera explains, as in a bent map; 0 where they are not.
@@ -91,6 +95,7 @@ class Evidence:
     changed: float = float("nan")
     reprojection_error_px: float = float("nan")
     deviation: float = float("nan")
+    roll_deg: float = float("nan")
     blur_px: float = float("nan")
     bend_px: float = float("nan")
     focal_error: float = float("nan")
@@ -161,6 +166,11 @@ def verdict(evidence: Evidence, limits: Limits) -> tuple[str, ...]:
     if evidence.inliers == 0:
         return (f"photo and render at the estimate have nothing in common: {evidence.counts}",)
     reasons = []
+    if evidence.deviation > limits.max_deviation and abs(evidence.roll_deg) > _MAX_ROLL_FAR_FROM_PRIOR:
+        reasons.append(
+            f"it looks the way that the prior does, turned by {abs(evidence.roll_deg):.0f} degrees about the camera's "
+            "axis: is the camera mounted so, or does the image show a picture of the place?"
+        )
     if focal_length_is_wrong(evidence):
         error, sigma = 100 * evidence.focal_error, 100 * evidence.focal_sigma
         reasons.append(

@@ -259,6 +259,7 @@ class Localizer:
                 changed=comparison.changed_share(),
                 reprojection_error_px=view.solution.reprojection_error,
                 deviation=prior.deviation(pose) if prior else float("nan"),
+                roll_deg=prior.roll_deg(pose) if prior else float("nan"),
                 bend_px=float(np.sqrt(fit.field.bent_variance)) if fit else float("nan"),
                 focal_error=fit.focal if fit else float("nan"),
                 focal_sigma=fit.focal_sigma if fit else float("nan"),

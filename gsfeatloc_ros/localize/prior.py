@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -13,6 +14,8 @@ from gsfeatloc_ros.localize.options import LocalizerOptions
 # The least variance of a prior, as a share of the variance of a prior that comes without covariance: priors may claim
 # to know a coordinate exactly, as RViz's planar ones do.
 _MIN_VARIANCE_SHARE = 0.01
+# Cameras whose optical axes are no farther apart look the same way.
+_SAME_WAY = math.cos(math.radians(45.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +58,16 @@ class Prior:
         unit, axes, sigmas = self._spread
         step = np.concatenate([pose[:3, 3] - self.pose[:3, 3], so3_log(pose[:3, :3] @ self.pose[:3, :3].T)])
         return float(np.linalg.norm(axes.T @ (step / unit) / sigmas))
+
+    def roll_deg(self, pose: np.ndarray) -> float:
+        """Return by how many degrees a pose (4, 4) T_map_camera is turned about its optical axis; NaN elsewhere.
+
+        It is the twist of the rotation between the two; elsewhere is where the pose does not look the same way.
+        """
+        rotation = self.pose[:3, :3].T @ pose[:3, :3]
+        if rotation[2, 2] < _SAME_WAY:
+            return math.nan
+        return math.degrees(math.atan2(rotation[1, 0] - rotation[0, 1], rotation[0, 0] + rotation[1, 1]))
 
     @cached_property
     def _spread(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from gsfeatloc_ros.common.geometry import make_pose, so3_exp
@@ -70,6 +70,16 @@ def test_a_pose_that_no_prior_expects_must_be_much_surer(deviation: float, says:
     (reason,) = verdict(unsure, Limits())
     assert f"(at most 1e-12{says})" in reason
     assert verdict(replace(unsure, deviation=8.0), Limits()) == ()
+
+
+def test_nobody_stands_on_his_head_without_that_the_prior_says_so() -> None:
+    far = replace(GOOD, deviation=8.1)
+    for roll in (float("nan"), -90.0, 0.0, 90.0):
+        assert verdict(replace(far, roll_deg=roll), Limits()) == ()
+    for roll in (-90.1, 180.0):
+        (reason,) = verdict(replace(far, roll_deg=roll), Limits())
+        assert f"turned by {abs(roll):.0f} degrees about the camera's axis" in reason
+        assert verdict(replace(GOOD, roll_deg=roll), Limits()) == ()
 
 
 @pytest.mark.parametrize(("deviation", "limit"), [(8.0, 0.7), (9.0, 0.15), (float("nan"), 0.4)])
@@ -180,6 +190,17 @@ def test_deviation_counts_standard_deviations_of_the_prior() -> None:
     assert Prior(np.eye(4), np.zeros((6, 6)), default, default).deviation(moved) == pytest.approx(
         np.sqrt((1 + 4) / 0.01)
     )
+
+
+@given(st.floats(-179.0, 179.0), st.floats(0.0, 180.0), st.floats(0.0, 360.0))
+def test_roll_is_the_turn_about_the_axis_of_who_looks_the_same_way(roll: float, apart: float, towards: float) -> None:
+    assume(abs(apart - 45.0) > 0.01)
+    default = np.diag([0.25] * 3 + [0.04] * 3)
+    prior = make_pose(so3_exp(np.array([0.3, -1.0, 2.0])), np.array([1.0, 2.0, 3.0]))
+    across = np.radians(apart) * np.array([np.cos(np.radians(towards)), np.sin(np.radians(towards)), 0.0])
+    pose = prior @ make_pose(so3_exp(across) @ so3_exp(np.array([0.0, 0.0, np.radians(roll)])), np.ones(3))
+    found = Prior(prior, default, default, default).roll_deg(pose)
+    assert found == pytest.approx(roll, abs=1e-6) if apart < 45.0 else np.isnan(found)
 
 
 def test_protection_levels_are_along_the_worst_axis() -> None:

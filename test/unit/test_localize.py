@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import re
 from dataclasses import replace
 
 import cv2
@@ -18,6 +19,7 @@ from gsfeatloc_ros.localize.localizer import Localizer
 from gsfeatloc_ros.localize.options import LocalizerOptions
 from gsfeatloc_ros.match import create_matcher
 from gsfeatloc_ros.render import Render, create_renderer
+from gsfeatloc_ros.simulate import simulate_photos
 
 
 @pytest.fixture(scope="module")
@@ -47,6 +49,20 @@ def test_finds_the_camera_within_a_degree_and_two_centimetres(localizer, room_ca
         assert estimate.status is Status.LOCALIZED, estimate.reason
         assert rotation_error_deg(estimate.T_map_camera, photo.T_map_camera) < 1.0
         assert translation_error(estimate.T_map_camera, photo.T_map_camera) < 0.02
+
+
+def test_a_picture_of_the_place_upside_down_is_none_of_it_unless_the_camera_is(sift_localizer, room) -> None:
+    """As what covers most of a photo may be. The pose that it shows is right for a camera that is mounted so."""
+    camera = Camera(640, 480, np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]]))
+    (photo,) = simulate_photos(room, camera, count=1, seed=1)
+    over = np.diag([-1.0, -1.0, 1.0, 1.0])
+    picture = np.ascontiguousarray(photo.image[::-1, ::-1])
+    estimate = sift_localizer.localize(picture, camera, photo.T_map_camera_prior)
+    assert_no_answer(estimate)
+    assert re.search("turned by 1[78][0-9] degrees about the camera's axis", estimate.reason), estimate.reason
+    estimate = sift_localizer.localize(picture, camera, photo.T_map_camera_prior @ over)
+    assert estimate.status is Status.LOCALIZED, estimate.reason
+    assert rotation_error_deg(estimate.T_map_camera, photo.T_map_camera @ over) < 1.0
 
 
 def test_the_answer_carries_its_evidence(sift_localizer, room_camera, room_photos) -> None:
