@@ -5,8 +5,6 @@ A pose ``T_a_b`` is a 4x4 float64 matrix that maps points of frame b into frame 
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -45,9 +43,8 @@ def skew(vector: np.ndarray) -> np.ndarray:
 
 def so3_exp(rotation_vector: np.ndarray) -> np.ndarray:
     """Return the rotation matrix (3, 3) of a rotation vector (3,) in radians (Rodrigues' formula)."""
-    x, y, z = map(float, rotation_vector)
-    angle = math.sqrt(x * x + y * y + z * z)
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    angle = np.linalg.norm(rotation_vector)
+    cross = skew(rotation_vector)
     if angle < _SMALL_ANGLE:
         return np.eye(3) + cross + 0.5 * cross @ cross
     return np.eye(3) + np.sin(angle) / angle * cross + (1 - np.cos(angle)) / angle**2 * cross @ cross
