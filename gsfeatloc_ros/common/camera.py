@@ -152,13 +152,13 @@ class Camera:
 
     def project(self, points: np.ndarray) -> np.ndarray:
         """Project camera-frame points (N, 3) with z > 0 to the pixels (N, 2) of `pinhole()`."""
-        homogeneous = points @ self._K_pinhole.T
-        return homogeneous[:, :2] / homogeneous[:, 2:]
+        return points[:, :2] / points[:, 2:] * (self.K[0, 0], self.K[1, 1]) + self.K[:2, 2]
 
     def rays(self, pixels: np.ndarray) -> np.ndarray:
         """Return the camera-frame directions (N, 3) with z = 1 through undistorted pixels (N, 2)."""
-        homogeneous = np.column_stack([pixels, np.ones(len(pixels))])
-        return homogeneous @ np.linalg.inv(self._K_pinhole).T
+        rays = np.ones((len(pixels), 3))
+        rays[:, :2] = (pixels - self.K[:2, 2]) / (self.K[0, 0], self.K[1, 1])
+        return rays
 
 
 @lru_cache(maxsize=4)

@@ -77,9 +77,9 @@ def _blurred_direction(photo: np.ndarray, render: np.ndarray) -> float | None:
 
 
 def _gradient_tensor(gray: np.ndarray) -> np.ndarray:
-    """Return the mean outer product (2, 2) of the gradients of brightness (H, W)."""
-    x, y = (cv2.Sobel(gray, cv2.CV_32F, *order) for order in ((1, 0), (0, 1)))
-    return np.array([[np.mean(x * x), np.mean(x * y)], [np.mean(x * y), np.mean(y * y)]], np.float64)
+    """Return the mean outer product (2, 2) of the gradients of brightness (H, W) uint8."""
+    x, y = (gradient.ravel().astype(np.float32) for gradient in cv2.spatialGradient(gray))
+    return np.array([[x @ x, x @ y], [x @ y, y @ y]], np.float64) / gray.size
 
 
 def _correlation(structure: np.ndarray, gray: np.ndarray) -> float:

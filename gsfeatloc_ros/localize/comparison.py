@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 
 import cv2
 import numpy as np
@@ -177,15 +177,21 @@ def _correlation(photo: Photo, view: MatchedView) -> np.ndarray:
     """Return the correlation (12, 16) of photo and render in each cell; NaN where there is nothing to compare."""
     a, b, compared, covered = _structures(photo, view)
     a, b = (np.where(covered, structure, np.float32(0)) for structure in (a, b))
-    (height, width), (across, down) = a.shape, CELLS
-    # Where rows are of a row of cells, and columns of a column.
-    rows = np.arange(down)[:, None] == np.arange(height) * down // height
-    columns = (np.arange(width) * across // width)[:, None] == np.arange(across)
+    rows, columns = _cells(*a.shape)
 
     def total(values: np.ndarray) -> np.ndarray:
-        return (rows.astype(np.float32) @ values.astype(np.float32) @ columns.astype(np.float32)).astype(np.float64)
+        return (rows @ values.astype(np.float32, copy=False) @ columns).astype(np.float64)
 
-    area, covered_area = height * width / (across * down), total(covered)
+    area, covered_area = a.size / (CELLS[0] * CELLS[1]), total(covered)
     enough = (covered_area >= _MIN_COVERED_SHARE * area) & (total(compared) >= _MIN_CONTRAST_SHARE * covered_area)
     correlation = total(a * b) / np.sqrt(np.maximum(total(a * a) * total(b * b), np.finfo(np.float64).tiny))
     return np.where(enough & (covered_area > 0), correlation, np.nan)
+
+
+@lru_cache(maxsize=4)
+def _cells(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return which rows of a picture are of a row of cells (12, H), and which columns of a column (W, 16): 1 or 0."""
+    across, down = CELLS
+    rows = np.arange(down)[:, None] == np.arange(height) * down // height
+    columns = (np.arange(width) * across // width)[:, None] == np.arange(across)
+    return rows.astype(np.float32), columns.astype(np.float32)

@@ -26,7 +26,7 @@ def too_little(query: Query) -> str:
     if len(corners) < limits.min_inliers or share < limits.min_coverage:
         needed = f"at least {limits.min_inliers} in {limits.min_coverage:.0%} needed"
         return f"{len(corners)} corners in {share:.0%} of the photo ({needed}): {_WHY}"
-    one_shade = _share_of_one_shade(query.photo.gray()[query.photo.seen])
+    one_shade = _share_of_one_shade(query.photo.gray(), query.photo.seen)
     return f"{one_shade:.1%} of the photo is of one shade: {_WHY}" if one_shade >= _MAX_OF_ONE_SHADE else ""
 
 
@@ -36,9 +36,12 @@ def too_few_features(small: Query) -> str:
     return f"{features} features in the photo: {_WHY}" if features < MIN_FEATURES else ""
 
 
-def _share_of_one_shade(levels: np.ndarray) -> float:
-    """Return the share of brightnesses (N,) uint8 that are about their median; by their counts, as all photos pay."""
-    counts = cv2.calcHist([levels], [0], None, [256], [0, 256]).ravel().astype(np.int64)
+def _share_of_one_shade(gray: np.ndarray, seen: np.ndarray) -> float:
+    """Return the share of the brightnesses (H, W) uint8, where they are seen (H, W) bool, that are about their median.
+
+    By their counts, as all photos pay.
+    """
+    counts = cv2.calcHist([gray], [0], seen.view(np.uint8), [256], [0, 256]).ravel().astype(np.int64)
     up_to = np.cumsum(counts)
-    median = 0.5 * np.searchsorted(up_to, [(len(levels) - 1) // 2, len(levels) // 2], side="right").sum()
-    return float(counts[np.abs(np.arange(256) - median) <= _SHADE].sum() / len(levels))
+    median = 0.5 * np.searchsorted(up_to, [(up_to[-1] - 1) // 2, up_to[-1] // 2], side="right").sum()
+    return float(counts[np.abs(np.arange(256) - median) <= _SHADE].sum() / up_to[-1])

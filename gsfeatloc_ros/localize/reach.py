@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
 from gsfeatloc_ros.common.camera import Camera
@@ -47,11 +49,7 @@ def expected_offset(render: Render, camera: Camera, prior: Prior) -> float:
 
     Infinite where the map shows nothing.
     """
-    across, down = _GRID
-    columns = (np.arange(across) + 0.5) * camera.width / across
-    rows = (np.arange(down) + 0.5) * camera.height / down
-    pixels = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
-    lifted = lift(render, camera, prior.pose, pixels, LiftOptions())
+    lifted = lift(render, camera, prior.pose, _grid(camera.width, camera.height), LiftOptions())
     points = lifted.points[lifted.valid]
     if len(points) == 0:
         return float("inf")
@@ -59,5 +57,13 @@ def expected_offset(render: Render, camera: Camera, prior: Prior) -> float:
     if linear is None:
         return float("inf")
     by_pose = linear.by_state[:, :, :POSE_PARAMETERS]
-    variances = np.einsum("mij,jk,mik->m", by_pose, prior.usual_covariance, by_pose)
-    return float(np.median(np.sqrt(np.maximum(variances, 0.0))))
+    variances = (by_pose @ prior.usual_covariance * by_pose).sum(axis=(1, 2))
+    return float(np.sqrt(max(np.median(variances), 0.0)))
+
+
+@lru_cache(maxsize=4)
+def _grid(width: int, height: int) -> np.ndarray:
+    """Return the pixels (48, 2) in the middles of the cells of a picture."""
+    across, down = _GRID
+    columns, rows = (np.arange(across) + 0.5) * width / across, (np.arange(down) + 0.5) * height / down
+    return np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)

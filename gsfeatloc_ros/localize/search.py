@@ -5,6 +5,7 @@ from __future__ import annotations
 import heapq
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import islice
 
 import numpy as np
@@ -60,7 +61,6 @@ class Search:
         now: clock, in seconds.
 
     Attributes:
-        small: the photo, at most SEARCH_WIDTH wide.
         best: the view that had most in common with the photo so far; None before one was rendered.
         views: number of views, other than the prior's, that were rendered to find the photo.
         searched: number of the index's views that were compared with it.
@@ -69,13 +69,17 @@ class Search:
 
     def __init__(self, query: Query, prior: Prior | None, now: Callable[[], float]) -> None:
         self._query, self._prior, self._now = query, prior, now
-        self.small = query.limited(SEARCH_WIDTH)
         self.best: MatchedView | None = None
         self.views = self.searched = self._around = 0
         self.poses_looked_from: list[np.ndarray] = []
         self._at_prior = False
         self._pending: list[tuple[float, int, Hint]] = []
         self._tried: list[_Place] = []
+
+    @cached_property
+    def small(self) -> Query:
+        """The photo, at most SEARCH_WIDTH wide."""
+        return self._query.limited(SEARCH_WIDTH)
 
     def tried(self, view: MatchedView) -> None:
         """Take note of what a pose led to, a view of the photo: no other pose that would lead there is yielded."""
@@ -119,14 +123,15 @@ class Search:
 
     @property
     def _index_views(self) -> int:
-        index = self.small.components.index
+        index = self._query.components.index
         return 0 if index is None else len(index)
 
     def rivals(self, found: MatchedView) -> Iterator[np.ndarray]:
         """Yield poses (4, 4), far from the one `found`, that explain the photo as well by the index and the prior."""
-        index, camera = self.small.components.index, self.small.photo.camera
+        index = self._query.components.index
         if index is None or found.solution is None:
             return
+        camera = self.small.photo.camera
         place = _Place.of(found)
         places = [place]
         elsewhere = [motion @ place.pose for motion in index.look_alikes]
