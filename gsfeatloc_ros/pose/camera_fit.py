@@ -10,7 +10,7 @@ from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.geometry import moved
 from gsfeatloc_ros.pose.linear import CAMERA_PARAMETERS, POSE_PARAMETERS, linearize, normal_equations
 from gsfeatloc_ros.pose.residual_field import ResidualField
-from gsfeatloc_ros.pose.solve import Correspondences, PoseOptions, shared_variance, whiten
+from gsfeatloc_ros.pose.solve import Correspondences, PoseOptions, whiten
 
 # Standard deviations of the camera's parameters (pose/linear.py), each of which is zero by the calibration.
 # To see whether the calibration is of this camera at all: so wide that what photos do not show stays near zero.
@@ -104,7 +104,7 @@ def _fit(camera: Camera, calibrated: _State, found: Correspondences, options: Po
     kept = problem.solve(system, np.clip(np.where(_CONTRADICTED, excess, 0.0), _EXACT, _ANY_CAMERA))
     # What a calibration in use, or one whose focal length is as far off as it reads, would move the pose by is not
     # known better than that.
-    off = np.clip(np.where(_CONTRADICTED, 0.0, excess), _CALIBRATED, _ANY_CAMERA)
+    off = np.clip(np.where(_CONTRADICTED, 0.0, np.abs(free.camera)), _CALIBRATED, _ANY_CAMERA)
     system = problem.at(kept)
     shift, field = system.step(off)[:6], problem.field(system)
     return CameraFit(
@@ -193,7 +193,7 @@ class _Problem:
         inflation = max((weights * system.squared).sum() / max(2 * weights.sum() - len(known), 1.0), 1.0)
         weighted = (weights[:, None, None] * system.jacobian).reshape(-1, len(known))
         of_a_match = weighted.T @ system.jacobian.reshape(-1, len(known)) / weights.sum()
-        shared = shared_variance(self.calibrated, field, self.options)
+        shared = field.shared_variance(self.options.shared_share)
         # What they have in common counts as one match with that error, beside what is known before.
         return inflation * np.linalg.inv(system.hessian + known) + np.linalg.inv(of_a_match / shared + known)
 

@@ -165,23 +165,13 @@ def add_up(whitening, residuals, jacobian, cauchy_scale, hessian, gradient, squa
 
 
 @njit(cache=True, nogil=True)
-def mean_products(pixels, residuals, agrees, near_distance, far_distance):
-    """Return half the mean product of residuals (M, 2) nearer to each other, and of those farther apart, 0 if negative.
-
-    Those that do not agree (M,) count among the nearer ones alone.
-    """
-    near = apart = 0.0
-    near_pairs = apart_pairs = 0
+def mean_product(pixels, residuals, least_distance, distance):
+    """Return half the mean product of residuals (M, 2) at pixels (M, 2) so far from each other; 0 if negative."""
+    total, pairs = 0.0, 0
     for a in range(len(pixels)):
         for b in range(a):
-            distance = (pixels[a, 0] - pixels[b, 0]) ** 2 + (pixels[a, 1] - pixels[b, 1]) ** 2
-            if distance >= far_distance**2:
-                continue
-            product = 0.5 * (residuals[a, 0] * residuals[b, 0] + residuals[a, 1] * residuals[b, 1])
-            if distance < near_distance**2:
-                near += product
-                near_pairs += 1
-            elif agrees[a] and agrees[b]:
-                apart += product
-                apart_pairs += 1
-    return max(near / max(near_pairs, 1), 0.0), max(apart / max(apart_pairs, 1), 0.0)
+            squared = (pixels[a, 0] - pixels[b, 0]) ** 2 + (pixels[a, 1] - pixels[b, 1]) ** 2
+            if least_distance**2 <= squared < distance**2:
+                total += 0.5 * (residuals[a, 0] * residuals[b, 0] + residuals[a, 1] * residuals[b, 1])
+                pairs += 1
+    return max(total / max(pairs, 1), 0.0)

@@ -6,9 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-# Matches nearer to each other than the first, in pixels, are neighbours: they share the blur, the splat, the edge.
-# What those between the two have in common is a field that is smooth over the photo.
+# What matches so far from each other, in pixels, have in common is a field that is smooth over the photo. Those that
+# are nearer are neighbours: they share the blur, the splat, the edge.
 _NEIGHBOUR_DISTANCE, _FIELD_DISTANCE = 25.0, 60.0
+MIN_PIXEL_SIGMA = 0.1
+"""Keypoints are no better than this, in pixels, however well a few of them happen to agree."""
 # All pairs of at most so many matches are looked at.
 _MAX_PAIRED = 400
 # A smooth field of this variance, in square pixels, is found in good maps too. What is beyond it the pose has as well.
@@ -25,14 +27,11 @@ class ResidualField:
     """Variances along an axis, in square pixels, of residuals after pose and camera were fitted.
 
     Attributes:
-        near: what neighbours have in common. The residuals of neighbours are alike where the photo is blurred or the
-            map is locally off.
-        smooth: what matches have in common that are farther apart. They are alike where the map is bent, or the camera
+        smooth: what matches have in common that are no neighbours. They are alike where the map is bent, or the camera
             is not as it is taken to be, in a way that no pose explains.
         total: of all.
     """
 
-    near: float
     smooth: float
     total: float
 
@@ -40,16 +39,16 @@ class ResidualField:
     def of(pixels: np.ndarray, residuals: np.ndarray, max_error: float) -> ResidualField:
         """Return the field of residuals (M, 2) at pixels (M, 2).
 
-        Residuals longer than `max_error` pixels count among neighbours alone: a cluster of wrong matches is no field.
+        Residuals longer than `max_error` pixels do not count: a cluster of wrong matches is no field.
         """
-        from gsfeatloc_ros.pose.kernels import mean_products
+        from gsfeatloc_ros.pose.kernels import mean_product
 
-        step = 1 + len(pixels) // _MAX_PAIRED
-        pixels, residuals = pixels[::step], residuals[::step]
-        agrees = (residuals**2).sum(axis=1) <= max_error**2
-        total = 0.5 * float((residuals[agrees] ** 2).sum(axis=1).mean()) if agrees.any() else 0.0
-        near, smooth = mean_products(pixels, residuals, agrees, _NEIGHBOUR_DISTANCE, _FIELD_DISTANCE)
-        return ResidualField(near, smooth, total)
+        squared = (residuals**2).sum(axis=1)
+        agrees = np.flatnonzero(squared <= max_error**2)
+        agrees = agrees[:: 1 + len(agrees) // _MAX_PAIRED]
+        total = 0.5 * float(squared[agrees].mean()) if len(agrees) else 0.0
+        smooth = mean_product(pixels[agrees], residuals[agrees], _NEIGHBOUR_DISTANCE, _FIELD_DISTANCE)
+        return ResidualField(smooth, total)
 
     @property
     def bent_variance(self) -> float:
@@ -60,7 +59,10 @@ class ResidualField:
         excess = min(self.smooth / _BENT_FIELD, self.smooth / (_BENT_SHARE * self.total)) if self.total else 0.0
         return _BENT_VARIANCE * float(np.clip(excess - 1, 0, 1))
 
-    @property
-    def shared_variance(self) -> float:
-        """Variance, in square pixels along an axis, of what the pose is off by, by the smooth field in all."""
-        return max(self.smooth - _USUAL_FIELD, 0.0) + self.bent_variance
+    def shared_variance(self, share: float) -> float:
+        """Return the variance, in square pixels along an axis, of the error that all matches have in common.
+
+        It is a share of the variance of what each is off by, and what the smooth field says beyond.
+        """
+        total = max(self.total, MIN_PIXEL_SIGMA**2)
+        return share * total + max(self.smooth - _USUAL_FIELD, 0.0) + self.bent_variance

@@ -15,13 +15,11 @@ from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.geometry import invert, make_pose
 from gsfeatloc_ros.common.parameter import parameter
 from gsfeatloc_ros.pose.linear import POSE_PARAMETERS, Linear, linearize, normal_equations
-from gsfeatloc_ros.pose.residual_field import ResidualField
+from gsfeatloc_ros.pose.residual_field import MIN_PIXEL_SIGMA, ResidualField
 
 _MIN_ITERATIONS, _MAX_ITERATIONS = 200, 10_000
 # A P3P sample and one match to choose among its solutions; under-determined sets have no covariance.
 MIN_POINTS = 4
-# Keypoints are no better than this, however well a few of them happen to agree.
-_MIN_PIXEL_SIGMA = 0.1
 _REFINE_ITERATIONS = 20
 _NOISE_ITERATIONS = 4
 # A pose is that of the matches where more than half of them are off by at most this many pixels.
@@ -39,17 +37,15 @@ class PoseOptions:
     Attributes:
         cauchy_scale: of the robust loss, in standard deviations. Real residuals have longer tails than a Gaussian's, so
             it is narrow.
-        shared_error: pixels of error that all matches have in common (errors of the map, of its poses, of the
-            calibration), which does not average out over them. Fitted on real photos: docs/trust.md.
-        shared_share: share of the variance that neighbouring residuals have in common which all matches have.
+        shared_share: share of the residuals' variance that all matches have in common (errors of the map, of its poses,
+            of the calibration) and that does not average out over them. Fitted on real photos: docs/trust.md.
     """
 
     max_reprojection_error: float = parameter(
         3.0, "Pixels of the resized image within which a corner agrees with a pose.", (0.1, 50.0), live=True
     )
     cauchy_scale: float = 1.0
-    shared_error: float = 0.08
-    shared_share: float = 0.1
+    shared_share: float = 0.055
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,22 +244,8 @@ def refine_pose(
     weighted = (weights[:, None, None] * by_pose).reshape(-1, POSE_PARAMETERS)
     information_of_a_match = weighted.T @ by_pose.reshape(-1, POSE_PARAMETERS) / weights.sum()
     field = ResidualField.of(pixels, residuals, options.max_reprojection_error)
-    shared = shared_variance(camera, field, options) * np.linalg.inv(information_of_a_match)
+    shared = field.shared_variance(options.shared_share) * np.linalg.inv(information_of_a_match)
     return pose, covariance * inflation + shared
-
-
-def shared_variance(camera: Camera, field: ResidualField, options: PoseOptions) -> float:
-    """Return the variance, in square pixels along an axis, of the error that all matches have in common.
-
-    Args:
-        camera: of the photo. A photo that shows a part of the lens (its centre is not the photo's) averages less over
-            the lens's errors: the variance grows as that part shrinks.
-        field: of the residuals.
-        options: how much of what neighbours have in common is taken to be common to all.
-    """
-    full = 2 * np.maximum(camera.K[:2, 2] + 0.5, [camera.width, camera.height] - (camera.K[:2, 2] + 0.5))
-    part = camera.width * camera.height / float(np.prod(full))
-    return options.shared_error**2 / part + options.shared_share * field.near + field.shared_variance
 
 
 def whiten(
@@ -279,4 +261,4 @@ def _whitening(residuals: np.ndarray, linear: Linear, sigmas: np.ndarray) -> np.
     from gsfeatloc_ros.pose.kernels import whitening_matrices
 
     sigmas = np.ascontiguousarray(sigmas, np.float64)
-    return whitening_matrices(residuals, linear.by_point, sigmas, _MIN_PIXEL_SIGMA, _NOISE_ITERATIONS)
+    return whitening_matrices(residuals, linear.by_point, sigmas, MIN_PIXEL_SIGMA, _NOISE_ITERATIONS)

@@ -23,14 +23,12 @@ from gsfeatloc_ros.common.geometry import (
 from gsfeatloc_ros.pose.descent import descend
 from gsfeatloc_ros.pose.lift import DEPTH_SIGMA_PER_STD, MAX_DEPTH_STD, LiftOptions, lift
 from gsfeatloc_ros.pose.linear import linearize, normal_equations
-from gsfeatloc_ros.pose.residual_field import ResidualField
 from gsfeatloc_ros.pose.solve import (
     MIN_POINTS,
     Correspondences,
     PoseOptions,
     refine_pose,
     reprojection_errors,
-    shared_variance,
     solve_near,
     solve_pose,
 )
@@ -246,7 +244,7 @@ def test_covariance_of_independent_errors_is_that_of_many_trials(depth_noise: fl
         sigmas = depth_noise * rays / np.linalg.norm(rays, axis=1, keepdims=True)
         moved = points + sigmas * rng.normal(size=(len(points), 1))
         lifted = Correspondences(found.pixels, moved, sigmas)
-        pose, covariance = refine_pose(CAMERA, POSE, lifted, PoseOptions(shared_error=0.0, shared_share=0.0))
+        pose, covariance = refine_pose(CAMERA, POSE, lifted, PoseOptions(shared_share=0.0))
         error = np.concatenate([pose[:3, 3] - POSE[:3, 3], so3_log(pose[:3, :3] @ POSE[:3, :3].T)])
         nees.append(error @ np.linalg.solve(covariance, error) / 6)
     assert 0.4 < np.mean(nees) < 1.2
@@ -259,15 +257,6 @@ def test_errors_that_matches_share_do_not_average_out() -> None:
         for found, _ in (scene(0, count=1000, noise=0.3), scene(0, count=100_000, noise=0.3))
     )
     assert np.trace(many[:3, :3]) > 0.5 * np.trace(few[:3, :3])
-
-
-def test_a_crop_is_less_sure_than_the_photo_it_is_of() -> None:
-    """The lens's errors average out less over a part of it; one that shows its middle cannot be told from a photo."""
-    field = ResidualField(near=0.0, smooth=0.0, total=0.01)
-    options = PoseOptions()
-    corner = replace(CAMERA, width=CAMERA.width // 2, height=CAMERA.height // 2)
-    whole, part = (shared_variance(camera, field, options) for camera in (CAMERA, corner))
-    assert part == pytest.approx(4 * whole, rel=0.05)
 
 
 def test_in_a_bent_map_the_covariance_grows() -> None:
