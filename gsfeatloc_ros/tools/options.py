@@ -100,17 +100,17 @@ def value_of(parameter: Parameter) -> Callable[[str], float]:
     return parse
 
 
-def number(kind: Callable[[str], float], minimum: float) -> Callable[[str], float]:
-    """Make the parser of a finite number, a whole one where `kind` is int, of at least `minimum`."""
-    name = "whole number" if kind is int else "number"
-    wanted = f"a {name} of at least {minimum:g}" if math.isfinite(minimum) else f"a {name}"
+def number(kind: Callable[[str], float], minimum: float, maximum: float = math.inf) -> Callable[[str], float]:
+    """Make the parser of a finite number, a whole one where `kind` is int, of at least and at most so much."""
+    bounds = [f"at {side} {bound:g}" for side, bound in (("least", minimum), ("most", maximum)) if math.isfinite(bound)]
+    wanted = ("a whole number" if kind is int else "a number") + (" of " + " and ".join(bounds) if bounds else "")
 
     def parse(text: str) -> float:
         try:
             value = kind(text)
         except ValueError:
             value = math.nan
-        if not (math.isfinite(value) and value >= minimum):
+        if not (math.isfinite(value) and minimum <= value <= maximum):
             raise argparse.ArgumentTypeError(f"{text!r} is not {wanted}")
         return value
 

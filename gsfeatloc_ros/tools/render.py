@@ -105,7 +105,9 @@ def make_parser() -> argparse.ArgumentParser:
     poses.add_argument("--path", type=Path, metavar="POSES.tum", help="many: a TUM file, as replay writes")
     cameras = parser.add_mutually_exclusive_group(required=True)
     cameras.add_argument("--camera", type=Path, metavar="FILE", help="calibration, as camera_calibration writes it")
-    cameras.add_argument("--fov", type=_field_of_view, metavar="DEG", help="horizontal field of view, with --size")
+    cameras.add_argument(
+        "--fov", type=number(float, 0.1, 170), metavar="DEG", help="horizontal field of view, with --size"
+    )
     parser.add_argument(
         "--size", type=picture_size, metavar="WxH", help="of the pictures, pixels (default: the camera's)"
     )
@@ -123,13 +125,6 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument("--threads", type=number(int, 0), default=0, help="CPU threads; 0 for one per core")
     add_map_options(parser)
     return parser
-
-
-def _field_of_view(text: str) -> float:
-    degrees = number(float, 0.1)(text)
-    if degrees > 170:
-        raise argparse.ArgumentTypeError(f"{text} is more than 170 degrees")
-    return degrees
 
 
 if __name__ == "__main__":

@@ -137,7 +137,9 @@ def make_parser() -> argparse.ArgumentParser:
         metavar="N",
         help="drawn at most, of more a sample, larger (default: %(default)s)",
     )
-    parser.add_argument("--port", type=_port, default=8080, help="or the next free one (default: %(default)s)")
+    parser.add_argument(
+        "--port", type=number(int, 0, _MAX_PORT), default=8080, help="or the next free one (default: %(default)s)"
+    )
     parser.add_argument(
         "--host", default=_LOOPBACK, help="address to listen on; there is no password (default: %(default)s)"
     )
@@ -148,13 +150,6 @@ def make_parser() -> argparse.ArgumentParser:
         "--ros-args", nargs=argparse.REMAINDER, default=[], help="of --live, at the end: remappings, as -r pose:=/there"
     )
     return parser
-
-
-def _port(text: str) -> int:
-    port = int(number(int, 0)(text))
-    if port > _MAX_PORT:
-        raise argparse.ArgumentTypeError(f"{port} is no port: they end with {_MAX_PORT}")
-    return port
 
 
 if __name__ == "__main__":

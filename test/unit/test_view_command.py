@@ -38,4 +38,4 @@ def test_an_address_that_this_machine_has_not_is_named(tmp_path, capsys):
 def test_a_port_that_is_none_is_named(capsys):
     with pytest.raises(SystemExit, match="2"):
         main(["room.ply", "--port", "65536"])
-    assert "argument --port: 65536 is no port" in capsys.readouterr().err
+    assert "argument --port: '65536' is not a whole number of at least 0 and at most 65535" in capsys.readouterr().err
