@@ -13,10 +13,11 @@ from gsfeatloc_ros.common.parameter import parameter
 _COVERAGE_CELLS = (8, 6)
 
 
-# A right calibration reads as a longer or shorter focal length by at most this share, beside the reading's own
-# standard deviation.
+# A right calibration reads as a longer or shorter focal length by at most this share, and the first number of the
+# reading's own standard deviations beside: of 430 right photos one is beyond. A wrong one that is off by no more than
+# the second of these beside may read as right.
 _MAX_FOCAL_ERROR = 0.01
-_FOCAL_SIGMAS = 1.5
+_FOCAL_SIGMAS, _UNSEEN_FOCAL_SIGMAS = 1.0, 1.5
 # Of a pose that no prior expects this share of the risk is taken, for a mirror image may be one, unless it is so many
 # times less likely to be wrong than what the photo's mirror image suggests.
 _UNEXPECTED = 1e-8
@@ -250,7 +251,7 @@ def is_uncertain(evidence: Evidence, limits: Limits) -> bool:
 
 def focal_length_is_wrong(evidence: Evidence) -> bool:
     """Return whether the photo contradicts the focal length that was calibrated."""
-    return abs(evidence.focal_error) > unseen_focal_error(evidence)
+    return abs(evidence.focal_error) > _MAX_FOCAL_ERROR + _FOCAL_SIGMAS * evidence.focal_sigma
 
 
 def camera_is_in_doubt(evidence: Evidence, limits: Limits) -> bool:
@@ -259,11 +260,11 @@ def camera_is_in_doubt(evidence: Evidence, limits: Limits) -> bool:
 
 
 def unseen_focal_error(evidence: Evidence) -> float:
-    """Return by what share a focal length may read as off without being wrong, NaN where that is not known.
+    """Return by what share a focal length may be off without being seen to be, NaN where that is not known.
 
     It is large where a photo shows a plane from the front: nearer, or with a longer lens, that looks the same.
     """
-    return _MAX_FOCAL_ERROR + _FOCAL_SIGMAS * evidence.focal_sigma
+    return _MAX_FOCAL_ERROR + _UNSEEN_FOCAL_SIGMAS * evidence.focal_sigma
 
 
 def probability_wrong(evidence: Evidence) -> float:
