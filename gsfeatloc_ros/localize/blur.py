@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -12,7 +13,7 @@ from gsfeatloc_ros.common.local_structure import local_structure
 # Photo and render are compared at this width.
 _WIDTH = 320
 # Blur shows where the photo's gradients along some direction have less than this share of the render's energy; or, as
-# the map may be less sharp than photos are, where that share is less than this part of the one across.
+# the map may be less sharp than photos are, where that share is less than this part of the one across: in a motion.
 _MAX_ENERGY_RATIO = 0.45
 _MAX_RELATIVE_RATIO = 0.55
 # What the render's gradients are given in every direction, as a share of their energy.
@@ -39,8 +40,9 @@ class Blur:
 def estimate_blur(photo: np.ndarray, render: np.ndarray) -> Blur | None:
     """Return how a photo is blurred; None where it is as sharp as the render.
 
-    The direction of a motion is that along which the photo's gradients have lost most against the render's; its length
-    is that with which the blurred render correlates best with the photo. The motion is taken to be even and straight.
+    The direction of a motion is that along which the photo's gradients have lost most against the render's; where they
+    have lost about as much across, it is out of focus. Its length is that with which the blurred render correlates best
+    with the photo. The motion is taken to be even and straight.
 
     Args:
         photo, render: (H, W) uint8 brightness of nearly the same view.
@@ -48,21 +50,20 @@ def estimate_blur(photo: np.ndarray, render: np.ndarray) -> Blur | None:
     height, width = photo.shape
     size = (min(_WIDTH, width), max(1, round(height * min(_WIDTH, width) / width)))
     photo, render = (cv2.resize(gray, size, interpolation=cv2.INTER_AREA) for gray in (photo, render))
-    direction = _blurred_direction(_gradient_tensor(photo), _gradient_tensor(render))
-    if direction is None:
+    make = _kind_of_blur(_gradient_tensor(photo), _gradient_tensor(render))
+    if make is None:
         return None
     structure, _ = local_structure(photo, _NEIGHBOURHOOD, _MIN_CONTRAST)
     best, found = _correlation(structure, render), None
     for extent in _EXTENTS:
-        for make in (_Motion(direction), _defocus):
-            correlation = _correlation(structure, cv2.filter2D(render, -1, make(extent * size[0])))
-            if correlation > best:
-                best, found = correlation, Blur(make(extent * width), extent * width)
+        correlation = _correlation(structure, cv2.filter2D(render, -1, make(extent * size[0])))
+        if correlation > best:
+            best, found = correlation, Blur(make(extent * width), extent * width)
     return found
 
 
-def _blurred_direction(photo: np.ndarray, render: np.ndarray) -> float | None:
-    """Return the angle along which the photo has lost most of its gradients' energy, None where it has lost little.
+def _kind_of_blur(photo: np.ndarray, render: np.ndarray) -> Callable[[float], np.ndarray] | None:
+    """Return what makes kernels of the photo's blur by their extent in pixels, None where it has lost little.
 
     Args:
         photo, render: (2, 2) gradient tensors.
@@ -70,10 +71,10 @@ def _blurred_direction(photo: np.ndarray, render: np.ndarray) -> float | None:
     # The generalized eigenvalues are the ratios of energy; a little of all directions keeps the render's invertible.
     root = np.linalg.cholesky(render + _MIN_ENERGY * (np.trace(render) + 1.0) * np.eye(2))
     ratios, vectors = np.linalg.eigh(np.linalg.solve(root, np.linalg.solve(root, photo).T))
-    if ratios[0] >= max(_MAX_ENERGY_RATIO, _MAX_RELATIVE_RATIO * ratios[1]):
-        return None
-    x, y = np.linalg.solve(root.T, vectors[:, 0])
-    return float(np.arctan2(y, x))
+    if ratios[0] < _MAX_RELATIVE_RATIO * ratios[1]:
+        x, y = np.linalg.solve(root.T, vectors[:, 0])
+        return _Motion(float(np.arctan2(y, x)))
+    return _defocus if ratios[0] < _MAX_ENERGY_RATIO else None
 
 
 def _gradient_tensor(gray: np.ndarray) -> np.ndarray:

@@ -211,20 +211,13 @@ class Localizer:
 
     def _refine(self, query: Query, pose: np.ndarray, prior: Prior | None) -> _Candidate:
         """Render and track at `pose`, then at each estimate, until the render is where the photo is; then verify."""
-        view = query.track(pose)
-        with query.clock.stage("track"):
-            blur = estimate_blur(query.photo.gray(), cv2.cvtColor(to_host(view.image), cv2.COLOR_RGB2GRAY))
+        view, blur = _look(query, pose)
         passes, max_passes = 1, self._components.options.max_passes
-        if blur is not None and passes < max_passes:
-            blurred = query.track(pose if view.solution is None else view.solution.T_map_camera, blur)
-            passes += 1
-            # Of a render that is not yet where the photo is a blur may be seen that is none.
-            view, blur = (blurred, blur) if blurred.inliers >= view.inliers else (view, None)
 
         def approach(view: MatchedView, max_offset: float) -> MatchedView:
-            nonlocal passes
+            nonlocal blur, passes
             while view.solution and view.offset(query.photo.camera) >= max_offset and passes < max_passes:
-                view = query.track(view.solution.T_map_camera, blur)
+                view, blur = _look(query, view.solution.T_map_camera)
                 passes += 1
             return view
 
@@ -266,6 +259,16 @@ class Localizer:
             )
             evidence = replace(evidence, probability_wrong=probability_wrong(evidence))
             return _Candidate(view, evidence, fit, verdict(evidence, options.limits))
+
+
+def _look(query: Query, pose: np.ndarray) -> tuple[MatchedView, Blur | None]:
+    """Render and track at a pose (4, 4); blurred as the photo is, if that is so and more corners agree then."""
+    view = query.track(pose)
+    with query.clock.stage("track"):
+        blur = estimate_blur(query.photo.gray(), cv2.cvtColor(to_host(view.image), cv2.COLOR_RGB2GRAY))
+    if blur is not None and (blurred := query.track(pose, blur)).inliers >= view.inliers:
+        return blurred, blur
+    return view, None
 
 
 def _counted(query: Query, view: MatchedView, blur: Blur | None, passes: int) -> Evidence:

@@ -36,8 +36,6 @@ _BATCH = 8
 _MIN_INDEX_HINT = 6
 # Of what the index suggested, so many are followed once all its views were compared.
 _MAX_FOLLOWED_HINTS = 12
-# Most views around a prior that are rendered once the index has found nothing.
-_VIEWS_AFTER_INDEX = 8
 # Poses from which the same points are seen at least so many pixels apart are different places.
 _MIN_DISTANCE_OF_RIVALS = 40.0
 # Where the photo was tracked to from farther than this share of its width, it is tracked a second time.
@@ -155,9 +153,7 @@ class Search:
     def _spread(self, prior: Prior) -> list[np.ndarray]:
         options = self.small.components.options
         min_step = _MIN_VIEW_STEP * np.sqrt(options.prior_covariance().diagonal())
-        has_index = self.small.components.index is not None
-        count = min(options.max_views, _VIEWS_AFTER_INDEX) if has_index else options.max_views
-        return spread_poses(prior.pose, prior.covariance, min_step, count, options.seed)
+        return spread_poses(prior.pose, prior.covariance, min_step, options.max_views, options.seed)
 
     def _tracked(self, prior: Prior) -> Iterator[np.ndarray]:
         """Yield the prior's pose where the photo is there, or that to which it is tracked from there.

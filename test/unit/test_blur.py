@@ -70,6 +70,14 @@ def test_a_defocus_is_found(sharp) -> None:
     assert np.abs(blurred.astype(float) - photo).mean() < 0.35 * np.abs(sharp.astype(float) - photo).mean()
 
 
+@pytest.mark.parametrize("off", [(0, 4), (3, 3), (-6, 5)])
+def test_what_is_off_across_a_motion_does_not_make_it_a_defocus(sharp, off: tuple[int, int]) -> None:
+    """From a prior the render is not where the photo is: the wider a kernel the more the two would be alike."""
+    blur = estimate_blur(moved(sharp, 25, 0.0), np.roll(sharp, off, axis=(1, 0)))
+    assert np.count_nonzero(blur.kernel.sum(axis=1)) <= 3
+    assert np.count_nonzero(blur.kernel.sum(axis=0)) >= 20
+
+
 @pytest.mark.parametrize("value", [0, 255])
 def test_pictures_of_one_colour_are_no_harm(sharp, value: int) -> None:
     blank = np.full_like(sharp, value)
