@@ -59,8 +59,8 @@ class Localizer:
     First small: where the prior is good, the photo's corners are tracked into a small render there. Where it is not, or
     that leads to no answer, features of photo and render are matched. Matches are lifted to 3D by the render's depth
     and solved for the pose. If there is still no answer, or no prior, the index of the map's views tells where else to
-    look; without an index, views around the prior are tried. Then at full size: the photo's corners are tracked to a
-    render at the estimate, lifted and solved, until the render is where the photo is.
+    look, and then views around the prior are tried. Then at full size: the photo's corners are tracked to a render at
+    the estimate, lifted and solved, until the render is where the photo is.
 
     That last render is what the estimate is verified by: what the map predicts there must match the photo.
     """
