@@ -40,7 +40,7 @@ _STYLE = {
 # Okabe and Ito's, which the colour-blind can tell apart.
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
 _LIMIT_COLOUR = "#b3261e"
-_STAGE_COLOURS = ("#0072b2", "#56b4e9", "#009e73", "#e69f00", "#cc79a7", "#d55e00", "#999999")
+_STAGE_COLOURS = ("#0072b2", "#56b4e9", "#009e73", "#e69f00", "#cc79a7", "#d55e00", "#999999", "#332288")
 
 
 def success_curves(named: Named, rotation: bool) -> str:
@@ -126,7 +126,8 @@ def calibration(named: Named) -> str:
 
 def stage_times(named: Named) -> str:
     """Plot where the time goes, in milliseconds a photo on average."""
-    with _Canvas(1, height=0.9 + 0.42 * len(named)) as canvas:
+    # At least as high as the legend is.
+    with _Canvas(1, height=max(0.9 + 0.42 * len(named), 2.4)) as canvas:
         (axes,) = canvas.axes
         stages = list(dict.fromkeys(stage for _, results in named for r in results for stage in r.stage_milliseconds))
         stages = [stage for stage in stages if stage != "total"]
