@@ -35,6 +35,7 @@ def test_one_core_is_enough_whatever_it_does(room_map_file, room_camera, photo, 
         "map__path": room_map_file,
         "matcher__name": matcher,
         "cpu__threads": 1,
+        "index__build": True,
         "index__path": tmp_path / "room.index",
         "index__views": 5000,
     }
