@@ -33,6 +33,7 @@ from tf2_msgs.msg import TFMessage
 
 SIZE = (480, 360)
 FOCAL_LENGTH = camera_of(SIZE).K[0, 0]
+LONGER = r"the focal length fits [\d.]+ \+- [\d.]+ % longer than camera_info says"
 # Seconds between photos; of odometry, and how far that is ahead.
 INTERVAL, PERIOD, AHEAD = 0.6, 0.05, 0.4
 START = 5000.0
@@ -147,7 +148,7 @@ def test_a_wrong_scale_is_named_and_no_transform_is_broadcast(tf, room_map_file,
     ("robot", "says", "value", "off"),
     [
         # The value to set has more digits than the percentage: a tenth of the 2 % that it is off.
-        (Robot(focal=0.02), r"% longer than camera_info says, by \d+ answers \(fx ([\d.]+),", FOCAL_LENGTH, 0.002),
+        (Robot(focal=0.02), rf"{LONGER}, by \d+ answers \(fx ([\d.]+),", FOCAL_LENGTH, 0.002),
         (Robot(late=0.08), r"odometry says that images are ([\d.]+) \+- [\d.]+ s late", 0.08, 0.1),
         (Robot(ahead=0.05), r"odometry says that the camera is ([\d.]+) \+- [\d.]+ m further forward", 0.05, 0.1),
     ],
