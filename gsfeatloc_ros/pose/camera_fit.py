@@ -17,10 +17,10 @@ from gsfeatloc_ros.pose.solve import Correspondences, PoseOptions, whiten
 _ANY_CAMERA = np.array([0.05, 0.1, 0.03, 0.03, 0.03])
 # How far a calibration in use is off: what the covariance allows for.
 _CALIBRATED = np.array([0.002, 0.005, 0.0015, 0.0015, 0.0015])
-# What the pose itself keeps to, unless the photo contradicts it. The focal length it keeps to in any case: it can
-# hardly be told from the distance, and a calibration is better than what one photo says.
+# What the pose itself keeps to, unless the photo contradicts it. The focal length, the first of them, it keeps to in
+# any case: it can hardly be told from the distance, and a calibration is better than what one photo says.
 _EXACT = np.array([1e-5, 0.001, 0.0005, 0.0005, 0.0005])
-_CONTRADICTED = np.array([False, True, True, True, True])
+_FOCAL = 0
 # Steps are taken until what they change, in standard deviations, is less than a thousandth.
 _MAX_ITERATIONS = 6
 _MIN_STEP = 1e-3
@@ -97,19 +97,25 @@ def _fit(camera: Camera, calibrated: _State, found: Correspondences, options: Po
     # The keypoints' noise is what is left once the camera's errors are explained.
     problem = _Problem.seen_from(free, camera, found, options)
     system = problem.at(free)
-    # A camera that is off leaves a smooth field as a bent map does: it must not excuse itself by that.
-    unbent = replace(problem.field(system), smooth=0.0)
-    sigmas = np.sqrt(np.maximum(np.diag(problem.covariance(system, unbent, _ANY_CAMERA))[6:], 0.0))
+    sigmas = problem.camera_sigmas(system, _ANY_CAMERA)
     excess = np.sqrt(np.maximum(free.camera**2 - sigmas**2, 0.0))
-    kept = problem.solve(system, np.clip(np.where(_CONTRADICTED, excess, 0.0), _EXACT, _ANY_CAMERA))
+    # What the photo does not contradict is as calibrated: it says more of the focal length then.
+    likely = np.clip(excess, _CALIBRATED, _ANY_CAMERA)
+    likely[_FOCAL] = _ANY_CAMERA[_FOCAL]
+    focal = free.camera[_FOCAL] + system.step(likely)[POSE_PARAMETERS + _FOCAL]
+    focal_sigma = problem.camera_sigmas(system, likely)[_FOCAL]
+    followed = np.clip(excess, _EXACT, _ANY_CAMERA)
+    followed[_FOCAL] = _EXACT[_FOCAL]
+    kept = problem.solve(system, followed)
     # What a calibration in use, or one whose focal length is as far off as it reads, would move the pose by is not
     # known better than that.
-    off = np.clip(np.where(_CONTRADICTED, 0.0, np.abs(free.camera)), _CALIBRATED, _ANY_CAMERA)
+    off = _CALIBRATED.copy()
+    off[_FOCAL] = np.clip(np.abs(focal), _CALIBRATED[_FOCAL], _ANY_CAMERA[_FOCAL])
     system = problem.at(kept)
     shift, field = system.step(off)[:6], problem.field(system)
     return CameraFit(
-        focal=float(free.camera[0]),
-        focal_sigma=float(sigmas[0]),
+        focal=float(focal),
+        focal_sigma=float(focal_sigma),
         k1=float(free.camera[1]),
         k1_sigma=float(sigmas[1]),
         rolling=free.camera[2:],
@@ -196,6 +202,12 @@ class _Problem:
         shared = field.shared_variance(self.options.shared_share)
         # What they have in common counts as one match with that error, beside what is known before.
         return inflation * np.linalg.inv(system.hessian + known) + np.linalg.inv(of_a_match / shared + known)
+
+    def camera_sigmas(self, system: _System, deviations: np.ndarray) -> np.ndarray:
+        """Return the standard deviations (5,) of the camera's parameters by the photo."""
+        # A camera that is off leaves a smooth field as a bent map does: it must not excuse itself by that.
+        unbent = replace(self.field(system), smooth=0.0)
+        return np.sqrt(np.maximum(np.diag(self.covariance(system, unbent, deviations))[POSE_PARAMETERS:], 0.0))
 
     def field(self, system: _System) -> ResidualField:
         """Return what the residuals have in common."""

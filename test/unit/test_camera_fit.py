@@ -101,6 +101,20 @@ def test_the_covariance_allows_for_a_focal_length_that_reads_as_off(error: float
     assert np.mean(squares) < 1.2
 
 
+@pytest.mark.parametrize(
+    ("error", "k1", "turn"), [(0.0, 0.0, 0.0), (-0.05, 0.0, 0.0), (0.02, -0.1, 0.0), (0.02, 0.0, 3)]
+)
+def test_the_focal_length_is_told_as_surely_as_it_reads(error: float, k1: float, turn: float) -> None:
+    """What the lens and the shutter are taken to be must not pass for another focal length."""
+    squares = []
+    for seed in range(20):
+        found = seen(longer(error), k1, turn * ROLLING, depths=(4, 5), seed=seed)
+        in_a_quarter = np.flatnonzero((found.pixels < [320, 240]).all(axis=1))[:60]
+        fit, _ = fitted(found.select(in_a_quarter))
+        squares.append(((fit.focal - error) / fit.focal_sigma) ** 2)
+    assert np.mean(squares) < 1.2
+
+
 def nees(found: Correspondences) -> float:
     """The normalised squared error of the fit, per degree of freedom."""
     fit, _ = fitted(found)
