@@ -95,8 +95,8 @@ class Search:
             yield from self._hints(look(self.small, [self._prior.pose]))
         if self.small.components.index is not None:
             yield from self._indexed()
-        # Once a pose was refined, and is refused, others near the prior are no better.
-        if self._prior is not None and len(self._tried) == tracked:
+        # Once a pose that the prior holds for possible was refined, and is refused, others near it are no better.
+        if self._prior is not None and not any(self._query.plausible(place.pose) for place in self._tried[tracked:]):
             poses = self._spread(self._prior)
             for start in range(0, len(poses), _BATCH):
                 batch = poses[start : start + _BATCH]

@@ -147,6 +147,16 @@ def test_easy_photos_search_nothing(renderer, room_camera, room_photos) -> None:
     assert estimate.evidence.views == 0
 
 
+def test_a_picture_of_the_place_does_not_end_the_search(renderer, room_camera, room_photos) -> None:
+    """What the photo shows is seen from where the prior excludes: what is beside it may be seen from the prior."""
+    photo = room_photos[0]
+    upside_down = np.ascontiguousarray(photo.image[::-1, ::-1])
+    estimate = Localizer(renderer, create_matcher("sift")).localize(upside_down, room_camera, photo.T_map_camera)
+    assert estimate.status is Status.REJECTED
+    assert "turned by 180 degrees" in estimate.reason
+    assert estimate.evidence.views > 8
+
+
 def test_the_search_ends_with_a_reason(renderer, room_camera) -> None:
     noise = np.random.default_rng(0).integers(0, 256, (480, 640, 3), dtype=np.uint8)
     doubtful = copy(renderer)
