@@ -18,10 +18,14 @@ _COVERAGE_CELLS = (8, 6)
 # the second of these beside may read as right.
 _MAX_FOCAL_ERROR = 0.01
 _FOCAL_SIGMAS, _UNSEEN_FOCAL_SIGMAS = 1.0, 1.5
-# Of a pose that no prior expects this share of the risk is taken, for a mirror image may be one, unless it is so many
-# times less likely to be wrong than what the photo's mirror image suggests.
-_UNEXPECTED = 1e-8
+# Wrong poses that match well are those of mirror images. Where the photo's mirror image suggests nothing, or what is a
+# hundred times more likely to be wrong, a pose is a hundred times less likely to be wrong than it was: of the mirrored
+# photos that match well the index finds more than that.
 _MIRROR_IS_WORSE = 1e-2
+_NO_MIRROR = 1e-2
+# Of a pose that no prior expects the first share of the risk is taken, or the second where that was seen to.
+_UNEXPECTED = 1e-8
+_UNEXPECTED_NO_MIRROR = 1e-2
 # And this share of one that a prior expects if the mirror image suggests what is less likely to be wrong.
 _MIRRORED = 1e-4
 # What is seen in a picture on a wall or in a mirror, or is one of several, may be somewhere else: at most this share of
@@ -73,7 +77,7 @@ class Evidence:
             pose and no camera explains, as in a bent map; 0 where they are not.
         focal_error: how much longer than calibrated the focal length fits the photo, relative.
         focal_sigma: standard deviation of that.
-        probability_wrong: that the pose is wrong.
+        probability_wrong: that the pose is wrong, by all that was looked at.
         mirror_probability_wrong: the same of the pose that the index suggests for the photo's mirror image, 1 where it
             suggests none; NaN where the index was not asked, as it is of a pose that no prior expects and that is not
             certain.
@@ -220,14 +224,19 @@ def _share_of_risk(evidence: Evidence, limits: Limits) -> float:
     wrong, mirror_wrong = evidence.probability_wrong, evidence.mirror_probability_wrong
     if evidence.deviation <= limits.max_deviation:
         return _MIRRORED if mirror_wrong < wrong else 1.0
-    return 1.0 if wrong <= _MIRROR_IS_WORSE * mirror_wrong else _UNEXPECTED
+    return _UNEXPECTED_NO_MIRROR if _is_no_mirror_image(evidence) else _UNEXPECTED
+
+
+def _is_no_mirror_image(evidence: Evidence) -> bool:
+    """Return whether the photo's mirror image was found to be so much worse that the photo is taken for none."""
+    return evidence.probability_wrong <= _NO_MIRROR * _MIRROR_IS_WORSE * evidence.mirror_probability_wrong
 
 
 def _why_so_little_risk(evidence: Evidence, limits: Limits) -> str:
     """Return in words why less risk is taken with a pose; nothing for one with which all is."""
     if _share_of_risk(evidence, limits) == 1.0:
         return ""
-    if evidence.mirror_probability_wrong < 1:
+    if evidence.mirror_probability_wrong < 1 and not _is_no_mirror_image(evidence):
         return ", for the photo's mirror image fits about as well: is the image flipped?"
     return _why_unexpected(evidence, limits)
 
@@ -245,8 +254,19 @@ def is_uncertain(evidence: Evidence, limits: Limits) -> bool:
     """Return whether the photo's mirror image, which was not looked for yet, decides on the pose."""
     if not math.isnan(evidence.mirror_probability_wrong):
         return False
-    best, worst = (verdict(replace(evidence, mirror_probability_wrong=wrong), limits) for wrong in (0.0, 1.0))
+    best, worst = (verdict(with_mirror(evidence, wrong), limits) for wrong in (0.0, 1.0))
     return bool(best) and not worst
+
+
+def with_mirror(evidence: Evidence, mirror_probability_wrong: float) -> Evidence:
+    """Return evidence with what the photo's mirror image says, which was not asked yet.
+
+    `mirror_probability_wrong` is the probability that the best pose of the mirror image is wrong, 1 if there is none.
+    """
+    wrong = evidence.probability_wrong
+    if wrong <= _MIRROR_IS_WORSE * mirror_probability_wrong:
+        wrong *= _NO_MIRROR
+    return replace(evidence, probability_wrong=wrong, mirror_probability_wrong=mirror_probability_wrong)
 
 
 def focal_length_is_wrong(evidence: Evidence) -> bool:

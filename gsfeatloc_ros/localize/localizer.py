@@ -29,7 +29,9 @@ from gsfeatloc_ros.localize.evidence import (
     is_uncertain,
     probability_wrong,
     verdict,
+    with_mirror,
 )
+from gsfeatloc_ros.localize.left_open import poses_left_open
 from gsfeatloc_ros.localize.options import LocalizerOptions
 from gsfeatloc_ros.localize.prior import Prior
 from gsfeatloc_ros.localize.query import Components, MatchedView, Query
@@ -49,6 +51,8 @@ _MAX_CAMERA_ERROR = 20.0
 # Views of the index that the photo's mirror image is compared with, and suggested poses of it that are followed.
 _MIRROR_VIEWS = 24
 _MIRROR_POSES = 2
+# Where more of the photo than this is not as in the map, it is asked whether another pose explains that.
+_MUCH_CHANGED = 0.3
 # Of two places that explain the photo, one is the better if it leads by so many standard deviations of chance.
 _MIN_LEAD = 3.0
 
@@ -169,12 +173,30 @@ class Localizer:
         """Yield what the poses of a search lead to, judged."""
         limits = self._components.options.limits
         mirror_probability_wrong = cache(partial(self._mirror_probability_wrong, query))
-        for pose in search.poses():
-            candidate = self._refine(query, pose, prior)
+
+        def judged(candidate: _Candidate) -> _Candidate:
             search.tried(candidate.view)
             if query.components.index is not None and is_uncertain(candidate.evidence, limits):
-                candidate = candidate.against_mirror(mirror_probability_wrong(), limits)
+                return candidate.against_mirror(mirror_probability_wrong(), limits)
+            return candidate
+
+        for pose in search.poses():
+            candidate = judged(self._refine(query, pose, prior))
+            if (better := self._explaining_more(query, candidate, prior)) is not candidate:
+                candidate = judged(better)
             yield candidate
+
+    def _explaining_more(self, query: Query, found: _Candidate, prior: Prior | None) -> _Candidate:
+        """Return a candidate, or one that it leaves open on which more corners agree.
+
+        A plane that agrees may leave the rest of the photo so far off that it looks as if it were covered.
+        """
+        if not (found.believed and found.pose and found.evidence.changed > _MUCH_CHANGED):
+            return found
+        lift_options = self._components.options.lift
+        poses = poses_left_open(query.photo.camera, found.view.render, *found.pose, lift_options)
+        others = [self._refine(query, pose, prior) for pose in poses]
+        return max(found, *others, key=lambda candidate: candidate.evidence.inliers) if others else found
 
     def _best(
         self, query: Query, found: _Candidate, search: Search, prior: Prior | None
@@ -309,7 +331,7 @@ class _Candidate:
 
     def against_mirror(self, mirror_probability_wrong: float, limits: Limits) -> _Candidate:
         """Return the candidate judged with what is known of the photo's mirror image."""
-        evidence = replace(self.evidence, mirror_probability_wrong=mirror_probability_wrong)
+        evidence = with_mirror(self.evidence, mirror_probability_wrong)
         return replace(self, evidence=evidence, reasons_against=verdict(evidence, limits))
 
     @property

@@ -10,7 +10,15 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from gsfeatloc_ros.common.geometry import make_pose, so3_exp
-from gsfeatloc_ros.localize.evidence import Evidence, Limits, coverage, is_uncertain, probability_wrong, verdict
+from gsfeatloc_ros.localize.evidence import (
+    Evidence,
+    Limits,
+    coverage,
+    is_uncertain,
+    probability_wrong,
+    verdict,
+    with_mirror,
+)
 from gsfeatloc_ros.localize.prior import Prior
 from gsfeatloc_ros.localize.protection import protection_level
 
@@ -90,32 +98,48 @@ def test_most_of_the_photo_must_be_as_in_the_map(deviation: float, limit: float)
         (reason,) = verdict(too_much, Limits())
         assert f"of the photo is not as in the map (at most {limit:.0%}" in reason
         # Its mirror image says nothing of that.
-        assert verdict(replace(too_much, mirror_probability_wrong=1.0), Limits()) == (reason,)
+        assert verdict(with_mirror(too_much, 1.0), Limits()) == (reason,)
 
 
 @pytest.mark.parametrize("deviation", [9.0, float("nan")])
 def test_the_mirror_image_decides_on_a_pose_that_no_prior_expects(deviation: float) -> None:
-    unsure = replace(GOOD, probability_wrong=1e-6, deviation=deviation)
+    unsure = replace(GOOD, probability_wrong=1e-4, deviation=deviation)
     assert is_uncertain(unsure, Limits())
-    nothing, better = (replace(unsure, mirror_probability_wrong=p) for p in (1.0, 1e-5))
+    nothing, worse, better = (with_mirror(unsure, p) for p in (1.0, 1.01e-2, 0.99e-2))
     assert verdict(nothing, Limits()) == ()
+    assert verdict(worse, Limits()) == ()
     (reason,) = verdict(better, Limits())
     assert "(at most 1e-12, for the photo's mirror image fits about as well: is the image flipped?)" in reason
     # It was asked already; it is not to be asked of what is sure, too risky, or refused all the same.
     for decided in (nothing, better, replace(GOOD, deviation=deviation)):
         assert not is_uncertain(decided, Limits())
-    for other in (replace(unsure, inliers=5), replace(unsure, probability_wrong=0.01)):
+    for other in (replace(unsure, inliers=5), replace(unsure, probability_wrong=1.01e-4)):
         assert not is_uncertain(other, Limits())
+    (reason,) = verdict(with_mirror(replace(unsure, probability_wrong=1.01e-4), 0.5), Limits())
+    assert "flipped" not in reason
 
 
 def test_a_mirror_image_that_fits_better_decides_on_a_pose_that_a_prior_expects() -> None:
     unsure, sure = replace(GOOD, probability_wrong=1e-6), replace(GOOD, probability_wrong=0.99e-8)
     assert is_uncertain(unsure, Limits())
     assert not is_uncertain(sure, Limits())
-    assert verdict(replace(unsure, mirror_probability_wrong=1.0e-6), Limits()) == ()
-    (reason,) = verdict(replace(unsure, mirror_probability_wrong=0.9e-6), Limits())
+    assert verdict(with_mirror(unsure, 1.0e-6), Limits()) == ()
+    (reason,) = verdict(with_mirror(unsure, 0.9e-6), Limits())
     assert "(at most 1e-08, for the photo's mirror image fits about as well: is the image flipped?)" in reason
-    assert verdict(replace(sure, mirror_probability_wrong=1e-9), Limits()) == ()
+    assert verdict(with_mirror(sure, 1e-9), Limits()) == ()
+
+
+def test_a_photo_whose_mirror_image_fits_nowhere_is_wrong_a_hundred_times_less_likely() -> None:
+    unsure = replace(GOOD, probability_wrong=0.99e-2)
+    assert is_uncertain(unsure, Limits())
+    found_nowhere, fits_worse, fits = (with_mirror(unsure, p) for p in (1.0, 0.991, 0.9))
+    assert found_nowhere.probability_wrong == fits_worse.probability_wrong == pytest.approx(0.99e-4)
+    assert verdict(found_nowhere, Limits()) == verdict(fits_worse, Limits()) == ()
+    assert fits.probability_wrong == unsure.probability_wrong
+    assert len(verdict(fits, Limits())) == 1
+    too_risky = replace(GOOD, probability_wrong=1.01e-2)
+    assert not is_uncertain(too_risky, Limits())
+    assert len(verdict(with_mirror(too_risky, 1.0), Limits())) == 1
 
 
 def test_limits_are_those_that_are_given() -> None:
