@@ -30,7 +30,7 @@ _UNEXPECTED_NO_MIRROR = 1e-2
 _MIRRORED = 1e-4
 # What is seen in a picture on a wall or in a mirror, or is one of several, may be somewhere else: at most this share of
 # the photo may be covered or changed, less without a prior, and least where the prior says something else.
-_MAX_CHANGED = 0.7
+_MAX_CHANGED = 0.75
 _MAX_CHANGED_WITHOUT_PRIOR = 0.4
 _MAX_CHANGED_FAR_FROM_PRIOR = 0.15
 # Who looks the same way and has been turned by more than this many degrees about the optical axis was no robot: a
