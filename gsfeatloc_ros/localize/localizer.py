@@ -38,6 +38,7 @@ from gsfeatloc_ros.localize.query import Components, MatchedView, Query
 from gsfeatloc_ros.localize.search import Search
 from gsfeatloc_ros.match import Matcher, Tracker, create_tracker
 from gsfeatloc_ros.pose.camera_fit import CameraFit, fit_camera
+from gsfeatloc_ros.pose.other_focal_length import STEP_SIGMA, other_focal_length
 from gsfeatloc_ros.pose.solve import Correspondences, reprojection_errors
 from gsfeatloc_ros.render.base import Renderer
 
@@ -184,7 +185,7 @@ class Localizer:
             candidate = judged(self._refine(query, pose, prior))
             if (better := self._explaining_more(query, candidate, prior)) is not candidate:
                 candidate = judged(better)
-            yield candidate
+            yield self._with_the_focal_length_asked(query, search, candidate)
 
     def _explaining_more(self, query: Query, found: _Candidate, prior: Prior | None) -> _Candidate:
         """Return a candidate, or one that it leaves open on which more corners agree.
@@ -197,6 +198,21 @@ class Localizer:
         poses = poses_left_open(query.photo.camera, found.view.render, *found.pose, lift_options)
         others = [self._refine(query, pose, prior) for pose in poses]
         return max(found, *others, key=lambda candidate: candidate.evidence.inliers) if others else found
+
+    def _with_the_focal_length_asked(self, query: Query, search: Search, found: _Candidate) -> _Candidate:
+        """Return a candidate, refused if features say that with another focal length more of the photo is explained."""
+        if not (found.believed and found.pose and found.evidence.changed > _MUCH_CHANGED):
+            return found
+        options, small = self._components.options, search.small
+        view = small.match(found.pose[0])
+        scale = small.photo.camera.width / query.photo.camera.width
+        with query.clock.stage("verify"):
+            pose_options = replace(options.pose, max_reprojection_error=scale * options.pose.max_reprojection_error)
+            error = other_focal_length(small.photo.camera, found.pose[0], view.found, pose_options, small.plausible)
+        if error == 0.0:
+            return found
+        evidence = replace(found.evidence, focal_error=error, focal_sigma=STEP_SIGMA)
+        return replace(found, evidence=evidence, reasons_against=verdict(evidence, options.limits))
 
     def _best(
         self, query: Query, found: _Candidate, search: Search, prior: Prior | None

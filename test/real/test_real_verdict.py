@@ -6,6 +6,7 @@ import numpy as np
 
 from gsfeatloc_ros.common.geometry import moved, rotation_error_deg, translation_error
 from gsfeatloc_ros.evaluate.corruptions import corrupt
+from gsfeatloc_ros.evaluate.protocol import PROTOCOLS
 from gsfeatloc_ros.evaluate.scene import load_scene, load_scene_renderer
 from gsfeatloc_ros.localize.localizer import Localizer
 from gsfeatloc_ros.localize.settings import RendererSettings
@@ -27,3 +28,15 @@ def test_a_wheel_that_agrees_does_not_hide_the_rest(scenes) -> None:
     assert estimate.localized, estimate.reason
     assert rotation_error_deg(estimate.T_map_camera, photo.T_map_camera) < 0.2
     assert translation_error(estimate.T_map_camera, photo.T_map_camera) < 0.05
+
+
+def test_a_part_that_fits_by_a_wrong_focal_length_is_no_answer(scenes) -> None:
+    """10 % short, a part of the photo agrees with a pose 2 degrees and 0.3 radii off, which its focal length fits."""
+    scene = load_scene(scenes / "bonsai")
+    number, photo = next((n, p) for n, p in enumerate(scene.photos) if p.name == "DSCF5813.jpg")
+    image, camera = corrupt("focal-10", scene.read_photo(photo), photo.camera, (103, number))
+    prior = next(prior for prior in PROTOCOLS["paper"](scene, 1.0, 103) if prior.photo == number)
+    localizer = Localizer(load_scene_renderer(scene, RendererSettings()), create_matcher("sift"))
+    estimate = localizer.localize(image, camera, prior.T_map_camera, prior.covariance)
+    assert not estimate.localized
+    assert "the focal length fits 8.0 +- 2.0 % longer than calibrated" in estimate.reason
