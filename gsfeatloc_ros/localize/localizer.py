@@ -201,9 +201,10 @@ class Localizer:
 
     def _with_the_focal_length_asked(self, query: Query, search: Search, found: _Candidate) -> _Candidate:
         """Return a candidate, refused if features say that with another focal length more of the photo is explained."""
-        if not (found.believed and found.pose and found.evidence.changed > _MUCH_CHANGED):
-            return found
         options, small = self._components.options, search.small
+        is_known = options.limits.max_focal_error >= 1
+        if is_known or not (found.believed and found.pose and found.evidence.changed > _MUCH_CHANGED):
+            return found
         view = small.match(found.pose[0])
         scale = small.photo.camera.width / query.photo.camera.width
         with query.clock.stage("verify"):

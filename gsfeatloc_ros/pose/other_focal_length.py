@@ -13,8 +13,8 @@ from gsfeatloc_ros.pose.solve import Correspondences, PoseOptions, reprojection_
 # How much longer than calibrated the focal lengths are that are tried, relative, and half of what lies between them.
 _OTHERS = (-0.12, -0.08, -0.04, 0.04, 0.08, 0.12)
 STEP_SIGMA = 0.02
-# Another one is the right one if it explains so many times as many matches. Chance makes it a few more.
-_CLEARLY_MORE = 1.2
+# Another one is the right one if it explains so many times as many matches, and so many more: chance makes it a few.
+_CLEARLY_MORE, _LEAST_MORE = 1.2, 10
 
 
 def other_focal_length(
@@ -36,8 +36,8 @@ def other_focal_length(
         options: of the solver.
         plausible: whether a pose (4, 4) may be the photo's.
     """
-    most = _CLEARLY_MORE * np.sum(reprojection_errors(camera, T_map_camera, found) <= options.max_reprojection_error)
-    best = 0.0
+    agreeing = np.sum(reprojection_errors(camera, T_map_camera, found) <= options.max_reprojection_error)
+    most, best = max(_CLEARLY_MORE * agreeing, agreeing + _LEAST_MORE), 0.0
     for error in _OTHERS:
         longer = replace(camera, K=camera.K @ np.diag([1 + error, 1 + error, 1.0]))
         solution = solve_pose(longer, found, options, 0, plausible)

@@ -64,6 +64,7 @@ def test_what_agrees_elsewhere_says_nothing() -> None:
     assert other_focal_length(CAMERA, POSE, found, OPTIONS, anywhere) == pytest.approx(0.08)
 
 
-def test_no_matches_say_nothing() -> None:
-    nothing = seen(0.0, wrong=0).select(np.arange(0))
-    assert other_focal_length(CAMERA, POSE, nothing, OPTIONS, anywhere) == 0.0
+@pytest.mark.parametrize("count", [0, 3, 9])
+def test_a_few_matches_say_nothing(count: int) -> None:
+    few = seen(0.08, wrong=0).select(np.arange(count))
+    assert other_focal_length(CAMERA, POSE, few, OPTIONS, anywhere) == 0.0
