@@ -192,7 +192,7 @@ class Localizer:
 
         A plane that agrees may leave the rest of the photo so far off that it looks as if it were covered.
         """
-        if not (found.believed and found.pose and found.evidence.changed > _MUCH_CHANGED):
+        if not (found.pose and found.is_believed_by_a_part):
             return found
         lift_options = self._components.options.lift
         poses = poses_left_open(query.photo.camera, found.view.render, *found.pose, lift_options)
@@ -203,7 +203,7 @@ class Localizer:
         """Return a candidate, refused if features say that with another focal length more of the photo is explained."""
         options, small = self._components.options, search.small
         is_known = options.limits.max_focal_error >= 1
-        if is_known or not (found.believed and found.pose and found.evidence.changed > _MUCH_CHANGED):
+        if is_known or not (found.pose and found.is_believed_by_a_part):
             return found
         view = small.match(found.pose[0])
         scale = small.photo.camera.width / query.photo.camera.width
@@ -212,8 +212,7 @@ class Localizer:
             error = other_focal_length(small.photo.camera, found.pose[0], view.found, pose_options, small.plausible)
         if error == 0.0:
             return found
-        evidence = replace(found.evidence, focal_error=error, focal_sigma=STEP_SIGMA)
-        return replace(found, evidence=evidence, reasons_against=verdict(evidence, options.limits))
+        return found.judged_by(replace(found.evidence, focal_error=error, focal_sigma=STEP_SIGMA), options.limits)
 
     def _best(
         self, query: Query, found: _Candidate, search: Search, prior: Prior | None
@@ -342,13 +341,21 @@ class _Candidate:
         """Whether nothing speaks against it."""
         return not self.reasons_against
 
+    @property
+    def is_believed_by_a_part(self) -> bool:
+        """Whether nothing speaks against it, but much of the photo is not explained."""
+        return self.believed and self.evidence.changed > _MUCH_CHANGED
+
     def only_the_camera_is_in_doubt(self, limits: Limits) -> bool:
         """Return whether nothing but the camera's calibration speaks against it: no other view would help."""
         return len(self.reasons_against) == 1 and camera_is_in_doubt(self.evidence, limits)
 
     def against_mirror(self, mirror_probability_wrong: float, limits: Limits) -> _Candidate:
         """Return the candidate judged with what is known of the photo's mirror image."""
-        evidence = with_mirror(self.evidence, mirror_probability_wrong)
+        return self.judged_by(with_mirror(self.evidence, mirror_probability_wrong), limits)
+
+    def judged_by(self, evidence: Evidence, limits: Limits) -> _Candidate:
+        """Return the candidate judged by other evidence."""
         return replace(self, evidence=evidence, reasons_against=verdict(evidence, limits))
 
     @property

@@ -97,13 +97,15 @@ def _fit(camera: Camera, calibrated: _State, found: Correspondences, options: Po
     # The keypoints' noise is what is left once the camera's errors are explained.
     problem = _Problem.seen_from(free, camera, found, options)
     system = problem.at(free)
-    sigmas = problem.camera_sigmas(system, _ANY_CAMERA)
+    # A camera that is off leaves a smooth field as a bent map does: it must not excuse itself by that.
+    unbent = replace(problem.field(system), smooth=0.0)
+    sigmas = problem.camera_sigmas(system, unbent, _ANY_CAMERA)
     excess = np.sqrt(np.maximum(free.camera**2 - sigmas**2, 0.0))
     # What the photo does not contradict is as calibrated: it says more of the focal length then.
     likely = np.clip(excess, _CALIBRATED, _ANY_CAMERA)
     likely[_FOCAL] = _ANY_CAMERA[_FOCAL]
     focal = free.camera[_FOCAL] + system.step(likely)[POSE_PARAMETERS + _FOCAL]
-    focal_sigma = problem.camera_sigmas(system, likely)[_FOCAL]
+    focal_sigma = problem.camera_sigmas(system, unbent, likely)[_FOCAL]
     followed = np.clip(excess, _EXACT, _ANY_CAMERA)
     followed[_FOCAL] = _EXACT[_FOCAL]
     kept = problem.solve(system, followed)
@@ -203,11 +205,9 @@ class _Problem:
         # What they have in common counts as one match with that error, beside what is known before.
         return inflation * np.linalg.inv(system.hessian + known) + np.linalg.inv(of_a_match / shared + known)
 
-    def camera_sigmas(self, system: _System, deviations: np.ndarray) -> np.ndarray:
+    def camera_sigmas(self, system: _System, field: ResidualField, deviations: np.ndarray) -> np.ndarray:
         """Return the standard deviations (5,) of the camera's parameters by the photo."""
-        # A camera that is off leaves a smooth field as a bent map does: it must not excuse itself by that.
-        unbent = replace(self.field(system), smooth=0.0)
-        return np.sqrt(np.maximum(np.diag(self.covariance(system, unbent, deviations))[POSE_PARAMETERS:], 0.0))
+        return np.sqrt(np.maximum(np.diag(self.covariance(system, field, deviations))[POSE_PARAMETERS:], 0.0))
 
     def field(self, system: _System) -> ResidualField:
         """Return what the residuals have in common."""
