@@ -156,7 +156,7 @@ def test_command_writes_the_report_and_goes_on_from_it(tmp_path, room, room_came
 
 @pytest.mark.parametrize("library", ["jinja2", "matplotlib"])
 def test_what_is_missing_is_named(tmp_path, monkeypatch, library):
-    for name in [name for name in sys.modules if name.partition(".")[0] == library]:
+    for name in {library, *(name for name in sys.modules if name.partition(".")[0] == library)}:
         monkeypatch.setitem(sys.modules, name, None)
     results = [made(rotation_error_deg=0.1)]
     with pytest.raises(RuntimeError, match=f"{library} is needed for this and is not installed: pip install {library}"):
