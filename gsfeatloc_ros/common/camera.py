@@ -98,6 +98,10 @@ class Camera:
         scale = min(focal_length / self.K[0, 0], max_side / max(self.width, self.height))
         return self.scaled(round(scale * self.width), max(1, round(scale * self.height))) if scale > 1 else self
 
+    def zoomed(self, error: float) -> Camera:
+        """Return the camera with a focal length that is longer by this share."""
+        return replace(self, K=self.K @ np.diag([1 + error, 1 + error, 1.0]))
+
     @property
     def distorted(self) -> bool:
         """Whether the camera is anything but a pinhole without skew; a fisheye without coefficients is."""

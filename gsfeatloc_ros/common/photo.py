@@ -55,6 +55,10 @@ class Photo:
         image, seen = (np.ascontiguousarray(picture[:, ::-1]) for picture in (self.image, self.seen))
         return Photo(image, seen, replace(self.camera, K=K, readout=None))
 
+    def zoomed(self, error: float) -> Photo:
+        """Return it as if the focal length were longer by this share."""
+        return replace(self, camera=self.camera.zoomed(error))
+
     def gray(self) -> np.ndarray:
         """Return the brightness (H, W) uint8."""
         return self._gray

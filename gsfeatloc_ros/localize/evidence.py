@@ -36,9 +36,12 @@ _MAX_CHANGED_FAR_FROM_PRIOR = 0.15
 # Who looks the same way and has been turned by more than this many degrees about the optical axis was no robot: a
 # picture of the place, upside down, was held before the camera.
 _MAX_ROLL_FAR_FROM_PRIOR = 90.0
-# What covers the photo is seldom found in the render. By a wrong calibration a part of the photo fits, and the rest is
-# found beside where it should be: at least this share of the corners that are found agree.
-_MIN_INLIER_RATIO = 0.8
+# By a wrong calibration a part of the photo fits, and the rest is found beside where it should be: at least this share
+# of the corners that are found agree. Some of what covers a photo is found by chance: where much is not as in the map,
+# fewer need agree, since it is asked then whether another focal length explains that.
+_MIN_INLIER_RATIO, _MIN_INLIER_RATIO_OF_CHANGED = 0.8, 0.65
+MUCH_CHANGED = 0.3
+"""Where more of the photo than this is not as in the map, it is asked whether something else explains that."""
 # The weights of what tells right from wrong answers (docs/trust.md), and what their sum is shifted and scaled by to be
 # the logarithm of the odds that the answer is wrong. The ratio counts by its logit, correlations by Fisher's z.
 _WEIGHTS = {"explained_inlier_ratio": -4.31, "correlation": -5.34, "low_correlation": -7.14}
@@ -201,8 +204,9 @@ def verdict(evidence: Evidence, limits: Limits) -> tuple[str, ...]:
             f"{evidence.correlation:.2f}; {evidence.changed:.0%} of the photo is not as in the map; {evidence.counts}"
         )
     ratio = float(np.minimum(evidence.inlier_ratio, evidence.render_inlier_ratio))
-    if not ratio >= _MIN_INLIER_RATIO:
-        reasons.append(f"{ratio:.0%} of the corners agree (at least {_MIN_INLIER_RATIO:.0%} needed)")
+    min_ratio = _MIN_INLIER_RATIO_OF_CHANGED if evidence.changed > MUCH_CHANGED else _MIN_INLIER_RATIO
+    if not ratio >= min_ratio:
+        reasons.append(f"{ratio:.0%} of the corners agree (at least {min_ratio:.0%} needed)")
     max_changed = _max_changed(evidence, limits)
     if not evidence.changed <= max_changed:
         most = f"at most {max_changed:.0%}{_why_unexpected(evidence, limits)}"

@@ -22,6 +22,7 @@ from gsfeatloc_ros.localize.comparison import changed_mask, compare, preference
 from gsfeatloc_ros.localize.content import too_few_features, too_little
 from gsfeatloc_ros.localize.estimate import Estimate, Status, Trace
 from gsfeatloc_ros.localize.evidence import (
+    MUCH_CHANGED,
     Evidence,
     Limits,
     camera_is_in_doubt,
@@ -31,7 +32,7 @@ from gsfeatloc_ros.localize.evidence import (
     verdict,
     with_mirror,
 )
-from gsfeatloc_ros.localize.left_open import poses_left_open
+from gsfeatloc_ros.localize.left_open import picture_shift, poses_left_open
 from gsfeatloc_ros.localize.options import LocalizerOptions
 from gsfeatloc_ros.localize.prior import Prior
 from gsfeatloc_ros.localize.query import Components, MatchedView, Query
@@ -39,7 +40,7 @@ from gsfeatloc_ros.localize.search import Search
 from gsfeatloc_ros.match import Matcher, Tracker, create_tracker
 from gsfeatloc_ros.pose.camera_fit import CameraFit, fit_camera
 from gsfeatloc_ros.pose.other_focal_length import STEP_SIGMA, other_focal_length
-from gsfeatloc_ros.pose.solve import Correspondences, reprojection_errors
+from gsfeatloc_ros.pose.solve import Correspondences, PoseOptions, reprojection_errors, solve_pose
 from gsfeatloc_ros.render.base import Renderer
 
 # A render nearer to the photo than this many pixels is at the estimate. Where it is not believed it is looked at from
@@ -52,8 +53,10 @@ _MAX_CAMERA_ERROR = 20.0
 # Views of the index that the photo's mirror image is compared with, and suggested poses of it that are followed.
 _MIRROR_VIEWS = 24
 _MIRROR_POSES = 2
-# Where more of the photo than this is not as in the map, it is asked whether another pose explains that.
-_MUCH_CHANGED = 0.3
+# Features that would move the picture by more pixels than these are followed.
+_MAX_FEATURES_SHIFT = 2.0
+# Another focal length is the right one if so many times as many corners agree, and so many more.
+_CLEARLY_MORE, _LEAST_MORE = 1.2, 10
 # Of two places that explain the photo, one is the better if it leads by so many standard deviations of chance.
 _MIN_LEAD = 3.0
 
@@ -183,36 +186,46 @@ class Localizer:
 
         for pose in search.poses():
             candidate = judged(self._refine(query, pose, prior))
-            if (better := self._explaining_more(query, candidate, prior)) is not candidate:
+            if (better := self._explaining_more(query, search, candidate, prior)) is not candidate:
                 candidate = judged(better)
             yield self._with_the_focal_length_asked(query, search, candidate)
 
-    def _explaining_more(self, query: Query, found: _Candidate, prior: Prior | None) -> _Candidate:
-        """Return a candidate, or one that it leaves open on which more corners agree.
+    def _explaining_more(self, query: Query, search: Search, found: _Candidate, prior: Prior | None) -> _Candidate:
+        """Return a candidate, or one on which more corners agree that it leaves open or that features suggest.
 
-        A plane that agrees may leave the rest of the photo so far off that it looks as if it were covered.
+        A plane that agrees may leave the rest of the photo so far off that it looks as if it were covered; and what
+        looks alike may agree when it should not.
         """
         if not (found.pose and found.is_believed_by_a_part):
             return found
-        lift_options = self._components.options.lift
-        poses = poses_left_open(query.photo.camera, found.view.render, *found.pose, lift_options)
-        others = [self._refine(query, pose, prior) for pose in poses]
+        small, options, seen = search.small, self._components.options, (query.photo.camera, found.view.render)
+        poses = poses_left_open(*seen, *found.pose, options.lift)
+        matched, small_options = small.match(found.pose[0]).found, _for_small(query, small)
+        with query.clock.stage("verify"):
+            by_features = solve_pose(small.photo.camera, matched, small_options, options.seed, small.plausible)
+        if by_features:
+            pose = by_features.T_map_camera
+            if picture_shift(*seen, found.pose[0], pose, options.lift) > _MAX_FEATURES_SHIFT:
+                poses.append(pose)
+        others = [self._refine(query, pose, prior) for pose in poses if query.plausible(pose)]
         return max(found, *others, key=lambda candidate: candidate.evidence.inliers) if others else found
 
     def _with_the_focal_length_asked(self, query: Query, search: Search, found: _Candidate) -> _Candidate:
-        """Return a candidate, refused if features say that with another focal length more of the photo is explained."""
+        """Return a candidate, refused if with another focal length many more corners agree."""
         options, small = self._components.options, search.small
         is_known = options.limits.max_focal_error >= 1
         if is_known or not (found.pose and found.is_believed_by_a_part):
             return found
-        view = small.match(found.pose[0])
-        scale = small.photo.camera.width / query.photo.camera.width
+        matched, small_options = small.match(found.pose[0]).found, _for_small(query, small)
         with query.clock.stage("verify"):
-            pose_options = replace(options.pose, max_reprojection_error=scale * options.pose.max_reprojection_error)
-            error = other_focal_length(small.photo.camera, found.pose[0], view.found, pose_options, small.plausible)
-        if error == 0.0:
+            other = other_focal_length(small.photo.camera, found.pose[0], matched, small_options, small.plausible)
+        if other is None:
             return found
-        return found.judged_by(replace(found.evidence, focal_error=error, focal_sigma=STEP_SIGMA), options.limits)
+        inliers = replace(query, photo=query.photo.zoomed(other.error)).track(other.T_map_camera).inliers
+        if inliers <= max(_CLEARLY_MORE * found.view.inliers, found.view.inliers + _LEAST_MORE):
+            return found
+        evidence = replace(found.evidence, focal_error=other.error, focal_sigma=STEP_SIGMA)
+        return found.judged_by(evidence, options.limits)
 
     def _best(
         self, query: Query, found: _Candidate, search: Search, prior: Prior | None
@@ -321,6 +334,13 @@ def _counted(query: Query, view: MatchedView, blur: Blur | None, passes: int) ->
     )
 
 
+def _for_small(query: Query, small: Query) -> PoseOptions:
+    """Return how to solve for the pose of a small photo as exactly as for that of the photo."""
+    options = query.components.options.pose
+    scale = small.photo.camera.width / query.photo.camera.width
+    return replace(options, max_reprojection_error=scale * options.max_reprojection_error)
+
+
 def _near(view: MatchedView) -> Correspondences:
     """Return the correspondences that may be right if the camera is not as it was calibrated."""
     assert view.solution is not None
@@ -344,7 +364,7 @@ class _Candidate:
     @property
     def is_believed_by_a_part(self) -> bool:
         """Whether nothing speaks against it, but much of the photo is not explained."""
-        return self.believed and self.evidence.changed > _MUCH_CHANGED
+        return self.believed and self.evidence.changed > MUCH_CHANGED
 
     def only_the_camera_is_in_doubt(self, limits: Limits) -> bool:
         """Return whether nothing but the camera's calibration speaks against it: no other view would help."""

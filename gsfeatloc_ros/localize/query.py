@@ -92,10 +92,11 @@ class Components:
 
 @dataclass
 class _LastRender:
-    """What was rendered last, and from which pose (4, 4)."""
+    """What was rendered last, and from which pose (4, 4); and what features say of it, if that was asked."""
 
     pose: np.ndarray = field(default_factory=lambda: np.eye(4))
     render: Render | None = None
+    matched: MatchedView | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,14 +141,20 @@ class Query:
             return self.components.create_tracker(self.photo, self.components.renderer.device)
 
     def match(self, pose: np.ndarray) -> MatchedView:
-        """Render the map at a pose (4, 4), match its features with the photo's, lift the matches and solve."""
+        """Render the map at a pose (4, 4), match its features with the photo's, lift the matches and solve.
+
+        Unless that is what was done last.
+        """
         matcher, photo_features, render = self.components.matcher, self.features, self.render(pose)
+        if self._last_render.matched is not None:
+            return self._last_render.matched
         with self.clock.stage("features"):
             image = render.device_image()
             features = matcher.features(image)
         with self.clock.stage("match"):
             matches = matcher.match(photo_features, features)
-        return self._solve(pose, render, image, matches)
+        self._last_render.matched = self._solve(pose, render, image, matches)
+        return self._last_render.matched
 
     def track(self, pose: np.ndarray, blur: Blur | None = None) -> MatchedView:
         """Do the same where the pose is nearly the photo's: track the photo's corners to the render instead.
@@ -190,7 +197,7 @@ class Query:
         if last.render is None or not np.array_equal(last.pose, pose):
             with self.clock.stage("render"):
                 last.render = self.components.renderer.render(self.photo.camera, pose)
-            last.pose = pose.copy()
+            last.pose, last.matched = pose.copy(), None
         return last.render
 
     @cached_property

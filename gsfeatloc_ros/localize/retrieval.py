@@ -12,8 +12,8 @@ from gsfeatloc_ros.localize.query import Query
 from gsfeatloc_ros.match.base import Features, Matches
 from gsfeatloc_ros.pose.solve import Correspondences, ransac_pose
 
-# Matches of a small photo with a view agree with a pose within so many pixels.
-_MAX_ERROR = 4.0
+MAX_ERROR = 4.0
+"""Pixels within which matches of a small photo with a view agree with a pose."""
 # Samples of RANSAC: enough for one right match in eight.
 _MAX_ITERATIONS = 2_000
 # A view whose pose a prior holds for possible counts so many times as much as another that as much speaks for.
@@ -106,7 +106,7 @@ class _Group:
         pixels, points = np.concatenate([m.a for m, _ in pairs]), np.concatenate([p for _, p in pairs])
         found = Correspondences(pixels, points, np.zeros_like(points))
         solved = ransac_pose(
-            self._small.photo.camera, found, _MAX_ERROR, self._small.components.options.seed, _MAX_ITERATIONS
+            self._small.photo.camera, found, MAX_ERROR, self._small.components.options.seed, _MAX_ITERATIONS
         )
         # A pixel that several views know counts once.
         return None if solved is None else (solved[0], len(np.unique(pixels[solved[1]], axis=0)))

@@ -18,8 +18,9 @@ from gsfeatloc_ros.localize.evidence import Evidence
 from gsfeatloc_ros.localize.prior import Prior
 from gsfeatloc_ros.localize.query import MatchedView, Query
 from gsfeatloc_ros.localize.reach import is_settled, is_worth_tracking, may_be_settled
-from gsfeatloc_ros.localize.retrieval import Hint, retrieve
+from gsfeatloc_ros.localize.retrieval import MAX_ERROR, Hint, retrieve
 from gsfeatloc_ros.match.base import Features
+from gsfeatloc_ros.pose.solve import Correspondences, solve_pose
 
 # Matches that agree on a pose, by which a view suggests it. Chance makes some agree too: the map is looked at from the
 # pose of a hint that is not strong, and has to confirm it.
@@ -91,19 +92,15 @@ class Search:
         if len(self.small.features) < MIN_FEATURES:
             return
         tracked = len(self._tried)
+        looked: list[MatchedView] = []
         if self._prior is not None:
-            yield from self._hints(look(self.small, [self._prior.pose]))
+            looked = look(self.small, [self._prior.pose])
+            yield from self._hints(looked)
         if self.small.components.index is not None:
             yield from self._indexed()
         # Once a pose that the prior holds for possible was refined, and is refused, others near it are no better.
         if self._prior is not None and not any(self._query.plausible(place.pose) for place in self._tried[tracked:]):
-            poses = self._spread(self._prior)
-            for start in range(0, len(poses), _BATCH):
-                batch = poses[start : start + _BATCH]
-                self._around += len(batch)
-                self.views += len(batch)
-                self.poses_looked_from += batch
-                yield from self._hints(look(self.small, batch))
+            yield from self._beside(self._prior, looked)
 
     @property
     def looked(self) -> str:
@@ -155,6 +152,19 @@ class Search:
         min_step = _MIN_VIEW_STEP * np.sqrt(options.prior_covariance().diagonal())
         return spread_poses(prior.pose, prior.covariance, min_step, options.max_views, options.seed)
 
+    def _beside(self, prior: Prior, looked: list[MatchedView]) -> Iterator[np.ndarray]:
+        """Look from around the prior and yield the poses that views suggest, alone or together with those `looked`."""
+        poses = self._spread(prior)
+        for start in range(0, len(poses), _BATCH):
+            batch = poses[start : start + _BATCH]
+            self._around += len(batch)
+            self.views += len(batch)
+            self.poses_looked_from += batch
+            views = look(self.small, batch)
+            yield from self._hints(views)
+            looked += views
+            yield from self._agreed(looked)
+
     def _tracked(self, prior: Prior) -> Iterator[np.ndarray]:
         """Yield the prior's pose where the photo is there, or that to which it is tracked from there.
 
@@ -186,6 +196,13 @@ class Search:
                 pose = self._confirmed(hint.solution.T_map_camera)
             if pose is not None and not self._was_tried(pose):
                 yield pose
+
+    def _agreed(self, looked: Sequence[MatchedView]) -> Iterator[np.ndarray]:
+        """Yield the pose on which views agree that were looked at, if a render there confirms it."""
+        agreed = agreed_pose(self.small, looked)
+        pose = None if agreed is None else self._confirmed(agreed)
+        if pose is not None and not self._was_tried(pose):
+            yield pose
 
     def _indexed(self) -> Iterator[np.ndarray]:
         """Compare the photo with the index's views and yield the poses that the best of them suggest."""
@@ -279,6 +296,27 @@ def look(query: Query, poses: Sequence[np.ndarray]) -> list[MatchedView]:
 def promising(views: Sequence[MatchedView]) -> list[MatchedView]:
     """Return those of views that were looked at together and sorted whose poses of the photo are worth following."""
     return [view for view in views[:_MAX_FOLLOWED_VIEWS] if view.inliers >= MIN_HINT]
+
+
+def agreed_pose(query: Query, views: Sequence[MatchedView]) -> np.ndarray | None:
+    """Return the pose (4, 4) of a photo on which matches with several views agree; None where too few do.
+
+    Of a photo that is mostly covered, or far from all views, each alone has too few.
+
+    Args:
+        query: the photo, at most SEARCH_WIDTH wide.
+        views: what it was matched with, at least one.
+    """
+    options, plausible = query.components.options, query.plausible
+    with query.clock.stage("search"):
+        found = Correspondences.concatenated([view.found for view in views])
+        pose_options = replace(options.pose, max_reprojection_error=MAX_ERROR)
+        solution = solve_pose(query.photo.camera, found, pose_options, options.seed, plausible)
+    if solution is None or not plausible(solution.T_map_camera):
+        return None
+    # A pixel that several views know counts once.
+    pixels = np.unique(found.pixels[solution.inliers], axis=0)
+    return solution.T_map_camera if len(pixels) >= MIN_HINT else None
 
 
 def spread_poses(

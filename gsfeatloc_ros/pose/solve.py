@@ -5,7 +5,7 @@ PoseLib was chosen over OpenCV's USAC by measurement: `python -m gsfeatloc_ros.t
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -65,6 +65,12 @@ class Correspondences:
     def select(self, kept: np.ndarray) -> Correspondences:
         """Return those that a mask (M,) or indices name."""
         return Correspondences(self.pixels[kept], self.points[kept], self.sigmas[kept])
+
+    @staticmethod
+    def concatenated(parts: Sequence[Correspondences]) -> Correspondences:
+        """Return those of all parts, of which there is at least one."""
+        columns = zip(*((part.pixels, part.points, part.sigmas) for part in parts), strict=True)
+        return Correspondences(*map(np.concatenate, columns))
 
 
 @dataclass(frozen=True, eq=False)

@@ -226,3 +226,10 @@ def test_a_centred_camera_looks_along_the_middle_of_its_image() -> None:
     np.testing.assert_allclose(camera.project(np.array([[0.0, 0.0, 2.0]])), [[159.5, 119.5]])
     assert camera.fov_x == pytest.approx(2 * np.arctan(160 / 288))
     assert not camera.distorted
+
+
+def test_a_longer_lens_shows_things_farther_from_the_middle() -> None:
+    camera = Camera(640, 480, np.array([[500.0, 2.0, 310.0], [0, 520.0, 250.0], [0, 0, 1]]))
+    points = np.array([[0.4, -0.2, 2.0], [-0.1, 0.5, 1.0], [0.0, 0.0, 3.0]])
+    off = camera.project(points) - [310.0, 250.0]
+    np.testing.assert_allclose(camera.zoomed(0.1).project(points) - [310.0, 250.0], 1.1 * off)

@@ -67,6 +67,17 @@ def test_each_limit_is_exact_and_named(name: str, limit: float, beyond: float, s
     assert says in reason
 
 
+@pytest.mark.parametrize("name", ["inlier_ratio", "render_inlier_ratio"])
+def test_of_a_covered_photo_fewer_corners_need_agree(name: str) -> None:
+    """Some of what covers it is found by chance."""
+    covered = replace(GOOD, changed=0.301)
+    assert verdict(replace(covered, **{name: 0.65}), Limits()) == ()
+    (reason,) = verdict(replace(covered, **{name: 0.6449}), Limits())
+    assert "64% of the corners agree (at least 65% needed)" in reason
+    (reason,) = verdict(replace(GOOD, changed=0.3, **{name: 0.65}), Limits())
+    assert "65% of the corners agree (at least 80% needed)" in reason
+
+
 @pytest.mark.parametrize(
     ("deviation", "says"),
     [(8.0001, ", for the pose is 8.0 standard deviations from the prior"), (float("nan"), " without a prior")],

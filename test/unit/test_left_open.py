@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from gsfeatloc_ros.common.camera import Camera
-from gsfeatloc_ros.common.geometry import invert, moved, so3_log, transform
-from gsfeatloc_ros.localize.left_open import poses_left_open
+from gsfeatloc_ros.common.geometry import invert, make_pose, moved, so3_exp, so3_log, transform
+from gsfeatloc_ros.localize.left_open import picture_shift, poses_left_open
 from gsfeatloc_ros.pose.lift import LiftOptions, lift
 from gsfeatloc_ros.render import create_renderer
 
@@ -57,6 +57,23 @@ def test_a_map_that_shows_nothing_leaves_none_open(view) -> None:
     camera, render, pose = view
     nothing = replace(render, alpha=np.zeros_like(render.alpha), median_depth=np.full_like(render.depth, np.nan))
     assert poses_left_open(camera, nothing, pose, WIDE, LiftOptions()) == []
+    assert picture_shift(camera, nothing, pose, pose, LiftOptions()) == np.inf
+
+
+def test_the_picture_moves_by_what_a_turn_is_in_pixels(view) -> None:
+    camera, render, pose = view
+    assert picture_shift(camera, render, pose, pose, LiftOptions()) == pytest.approx(0, abs=1e-6)
+    for angle in (0.002, -0.01):
+        turned = pose @ make_pose(so3_exp(np.array([0, angle, 0])), np.zeros(3))
+        shift = picture_shift(camera, render, pose, turned, LiftOptions())
+        # Off the axis pixels are smaller: by up to 1 / cos^2 of the angle to it.
+        assert abs(angle) * camera.K[0, 0] <= shift <= 1.5 * abs(angle) * camera.K[0, 0]
+
+
+def test_nothing_is_seen_by_who_looks_the_other_way(view) -> None:
+    camera, render, pose = view
+    away = pose @ make_pose(so3_exp(np.array([0, np.pi, 0])), np.zeros(3))
+    assert picture_shift(camera, render, pose, away, LiftOptions()) == np.inf
 
 
 def step_to(pose: np.ndarray, other: np.ndarray) -> np.ndarray:

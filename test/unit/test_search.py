@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from copy import copy
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from gsfeatloc_ros.localize.estimate import Status
 from gsfeatloc_ros.localize.localizer import Localizer
 from gsfeatloc_ros.localize.options import LocalizerOptions
 from gsfeatloc_ros.localize.query import Components, MatchedView, Query
-from gsfeatloc_ros.localize.search import SEARCH_WIDTH, look, promising, spread_poses
+from gsfeatloc_ros.localize.search import SEARCH_WIDTH, agreed_pose, look, promising, spread_poses
 from gsfeatloc_ros.maps import Reading
 from gsfeatloc_ros.match import create_matcher, create_tracker
 from gsfeatloc_ros.render import create_renderer
@@ -94,10 +95,14 @@ def renderer(room_map):
     return create_renderer(room_map)
 
 
+def small_query(renderer, camera, image: np.ndarray) -> Query:
+    components = Components(renderer, create_matcher("sift"), create_tracker, LocalizerOptions())
+    return Query(components, Photo.undistorted(image, camera, SEARCH_WIDTH), StageClock())
+
+
 def seen(renderer, camera, image: np.ndarray, views: list[np.ndarray]) -> list[MatchedView]:
     """The views of the map from some poses, beside a photo."""
-    components = Components(renderer, create_matcher("sift"), create_tracker, LocalizerOptions())
-    return look(Query(components, Photo.undistorted(image, camera, SEARCH_WIDTH), StageClock()), views)
+    return look(small_query(renderer, camera, image), views)
 
 
 def turned(pose: np.ndarray, degrees: float) -> np.ndarray:
@@ -122,6 +127,35 @@ def test_views_that_share_nothing_are_not_followed(renderer, room_camera, room_p
     truth = room_photos[0].T_map_camera
     assert promising(seen(renderer, room_camera, room_photos[0].image, [turned(truth, 180)])) == []
     assert promising(seen(renderer, room_camera, room_photos[0].image, [])) == []
+
+
+def test_views_that_each_have_too_few_matches_agree_on_a_pose(renderer, room_camera, room_photos) -> None:
+    photo = room_photos[0]
+    query = small_query(renderer, room_camera, photo.image)
+    view = query.match(photo.T_map_camera)
+    agreeing = np.flatnonzero(view.solution.inliers)
+    parts = [replace(view, found=view.found.select(agreeing[start : start + 5]), solution=None) for start in (0, 5, 10)]
+    assert promising(parts) == []
+    agreed = agreed_pose(query, parts)
+    assert rotation_error_deg(agreed, photo.T_map_camera) < 2.0
+    assert translation_error(agreed, photo.T_map_camera) < 0.1
+    # The same five matches three times are five.
+    assert agreed_pose(query, [parts[0]] * 3) is None
+
+
+def test_views_do_not_agree_on_a_pose_that_the_prior_excludes(renderer, room_camera, room_photos) -> None:
+    photo = room_photos[0]
+    query = small_query(renderer, room_camera, photo.image)
+    view = query.match(photo.T_map_camera)
+    assert agreed_pose(query, [view]) is not None
+    assert agreed_pose(replace(query, plausible=lambda pose: False), [view]) is None
+
+
+def test_views_without_matches_agree_on_nothing(renderer, room_camera, room_photos) -> None:
+    photo = room_photos[0]
+    query = small_query(renderer, room_camera, photo.image)
+    view = query.match(photo.T_map_camera)
+    assert agreed_pose(query, [replace(view, found=view.found.select([]), solution=None)]) is None
 
 
 @pytest.mark.slow
