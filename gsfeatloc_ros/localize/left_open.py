@@ -50,9 +50,7 @@ def poses_left_open(
     return [moved(pose, step), moved(pose, -step)]
 
 
-def picture_shift(
-    camera: Camera, render: Render, pose: np.ndarray, other: np.ndarray, options: LiftOptions
-) -> float:
+def picture_shift(camera: Camera, render: Render, pose: np.ndarray, other: np.ndarray, options: LiftOptions) -> float:
     """Return by how many pixels (RMS) the picture moves from one pose (4, 4), of a render, to another.
 
     Infinite where nothing of it is seen from there, or its depths cannot be trusted. The others as of poses_left_open.
