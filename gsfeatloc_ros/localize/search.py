@@ -92,15 +92,16 @@ class Search:
         if len(self.small.features) < MIN_FEATURES:
             return
         tracked = len(self._tried)
-        looked: list[MatchedView] = []
+        found: list[Correspondences] = []
         if self._prior is not None:
-            looked = look(self.small, [self._prior.pose])
-            yield from self._hints(looked)
+            views = look(self.small, [self._prior.pose])
+            yield from self._hints(views)
+            found = [view.found for view in views]
         if self.small.components.index is not None:
             yield from self._indexed()
         # Once a pose that the prior holds for possible was refined, and is refused, others near it are no better.
         if self._prior is not None and not any(self._query.plausible(place.pose) for place in self._tried[tracked:]):
-            yield from self._beside(self._prior, looked)
+            yield from self._beside(self._prior, found)
 
     @property
     def looked(self) -> str:
@@ -152,8 +153,11 @@ class Search:
         min_step = _MIN_VIEW_STEP * np.sqrt(options.prior_covariance().diagonal())
         return spread_poses(prior.pose, prior.covariance, min_step, options.max_views, options.seed)
 
-    def _beside(self, prior: Prior, looked: list[MatchedView]) -> Iterator[np.ndarray]:
-        """Look from around the prior and yield the poses that views suggest, alone or together with those `looked`."""
+    def _beside(self, prior: Prior, found: list[Correspondences]) -> Iterator[np.ndarray]:
+        """Look from around the prior and yield the poses that views suggest, alone or together.
+
+        `found` are the matches at the prior; those of each view are added.
+        """
         poses = self._spread(prior)
         for start in range(0, len(poses), _BATCH):
             batch = poses[start : start + _BATCH]
@@ -162,8 +166,8 @@ class Search:
             self.poses_looked_from += batch
             views = look(self.small, batch)
             yield from self._hints(views)
-            looked += views
-            yield from self._agreed(looked)
+            found += [view.found for view in views]
+            yield from self._agreed(found)
 
     def _tracked(self, prior: Prior) -> Iterator[np.ndarray]:
         """Yield the prior's pose where the photo is there, or that to which it is tracked from there.
@@ -197,9 +201,9 @@ class Search:
             if pose is not None and not self._was_tried(pose):
                 yield pose
 
-    def _agreed(self, looked: Sequence[MatchedView]) -> Iterator[np.ndarray]:
-        """Yield the pose on which views agree that were looked at, if a render there confirms it."""
-        agreed = agreed_pose(self.small, looked)
+    def _agreed(self, found: Sequence[Correspondences]) -> Iterator[np.ndarray]:
+        """Yield the pose on which the matches of several views agree, if a render there confirms it."""
+        agreed = agreed_pose(self.small, found)
         pose = None if agreed is None else self._confirmed(agreed)
         if pose is not None and not self._was_tried(pose):
             yield pose
@@ -298,24 +302,24 @@ def promising(views: Sequence[MatchedView]) -> list[MatchedView]:
     return [view for view in views[:_MAX_FOLLOWED_VIEWS] if view.inliers >= MIN_HINT]
 
 
-def agreed_pose(query: Query, views: Sequence[MatchedView]) -> np.ndarray | None:
+def agreed_pose(query: Query, found: Sequence[Correspondences]) -> np.ndarray | None:
     """Return the pose (4, 4) of a photo on which matches with several views agree; None where too few do.
 
     Of a photo that is mostly covered, or far from all views, each alone has too few.
 
     Args:
         query: the photo, at most SEARCH_WIDTH wide.
-        views: what it was matched with, at least one.
+        found: its matches with each view, of which there is at least one.
     """
     options, plausible = query.components.options, query.plausible
     with query.clock.stage("search"):
-        found = Correspondences.concatenated([view.found for view in views])
+        together = Correspondences.concatenated(found)
         pose_options = replace(options.pose, max_reprojection_error=MAX_ERROR)
-        solution = solve_pose(query.photo.camera, found, pose_options, options.seed, plausible)
+        solution = solve_pose(query.photo.camera, together, pose_options, options.seed, plausible)
     if solution is None or not plausible(solution.T_map_camera):
         return None
     # A pixel that several views know counts once.
-    pixels = np.unique(found.pixels[solution.inliers], axis=0)
+    pixels = np.unique(together.pixels[solution.inliers], axis=0)
     return solution.T_map_camera if len(pixels) >= MIN_HINT else None
 
 
