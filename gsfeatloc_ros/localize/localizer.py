@@ -39,7 +39,7 @@ from gsfeatloc_ros.localize.query import Components, MatchedView, Query
 from gsfeatloc_ros.localize.search import Search
 from gsfeatloc_ros.match import Matcher, Tracker, create_tracker
 from gsfeatloc_ros.pose.camera_fit import CameraFit, fit_camera
-from gsfeatloc_ros.pose.other_focal_length import STEP_SIGMA, other_focal_length
+from gsfeatloc_ros.pose.other_focal_length import STEP_SIGMA, other_focal_lengths
 from gsfeatloc_ros.pose.solve import Correspondences, PoseOptions, reprojection_errors, solve_pose
 from gsfeatloc_ros.render.base import Renderer
 
@@ -218,13 +218,15 @@ class Localizer:
             return found
         matched, small_options = small.match(found.pose[0]).found, _for_small(query, small)
         with query.clock.stage("verify"):
-            other = other_focal_length(small.photo.camera, found.pose[0], matched, small_options, small.plausible)
-        if other is None:
+            others = other_focal_lengths(small.photo.camera, found.pose[0], matched, small_options, small.plausible)
+        most, error = max(_CLEARLY_MORE * found.view.inliers, found.view.inliers + _LEAST_MORE), 0.0
+        for other in others:
+            view = replace(query, photo=query.photo.zoomed(other.error)).track(other.T_map_camera)
+            if view.inliers > most:
+                most, error = view.inliers, other.error
+        if error == 0.0:
             return found
-        inliers = replace(query, photo=query.photo.zoomed(other.error)).track(other.T_map_camera).inliers
-        if inliers <= max(_CLEARLY_MORE * found.view.inliers, found.view.inliers + _LEAST_MORE):
-            return found
-        evidence = replace(found.evidence, focal_error=other.error, focal_sigma=STEP_SIGMA)
+        evidence = replace(found.evidence, focal_error=error, focal_sigma=STEP_SIGMA)
         return found.judged_by(evidence, options.limits)
 
     def _best(

@@ -1,4 +1,4 @@
-"""Whether a wholly different focal length explains a photo better, which a fit near one pose does not see."""
+"""Wholly different focal lengths that may explain a photo better, which a fit near one pose does not see."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import numpy as np
 from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.pose.solve import Correspondences, PoseOptions, reprojection_errors, solve_pose
 
-# How much longer than calibrated the focal lengths are that are tried, relative, the nearest first; and half of what
-# lies between them.
-_OTHERS = (-0.04, 0.04, -0.08, 0.08, -0.12, 0.12)
+# How much longer than calibrated the focal lengths are that are tried, relative, and half of what lies between them.
+_OTHERS = (-0.12, -0.08, -0.04, 0.04, 0.08, 0.12)
 STEP_SIGMA = 0.02
-# Another one is worth a closer look if it explains so many matches more, and so many at all.
-_LEAST_MORE, _MIN_MATCHES = 3, 12
+# Another one is worth a closer look if it explains such a share of the calibration's matches, and so many at all:
+# features are few, and do not decide.
+_MIN_SHARE, _MIN_MATCHES = 0.9, 12
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,14 +31,14 @@ class OtherFocalLength:
     T_map_camera: np.ndarray
 
 
-def other_focal_length(
+def other_focal_lengths(
     camera: Camera,
     T_map_camera: np.ndarray,
     found: Correspondences,
     options: PoseOptions,
     plausible: Callable[[np.ndarray], bool],
-) -> OtherFocalLength | None:
-    """Return the focal length that explains more matches than the calibrated one; None where there is none.
+) -> list[OtherFocalLength]:
+    """Return the focal lengths that explain about as many matches as the calibrated one, or more.
 
     With a wrong one a part of a photo may agree with a pose, and nothing else: the corners beside are so far off that
     tracking does not find them. Features are found there too.
@@ -51,9 +51,10 @@ def other_focal_length(
         plausible: whether a pose (4, 4) may be the photo's.
     """
     agreeing = np.sum(reprojection_errors(camera, T_map_camera, found) <= options.max_reprojection_error)
-    most, best = max(agreeing + _LEAST_MORE, _MIN_MATCHES - 1), None
-    for error in _OTHERS:
-        solution = solve_pose(camera.zoomed(error), found, options, 0, plausible)
-        if solution and solution.inliers.sum() > most and plausible(solution.T_map_camera):
-            most, best = solution.inliers.sum(), OtherFocalLength(error, solution.T_map_camera)
-    return best
+    enough = max(_MIN_SHARE * agreeing, _MIN_MATCHES)
+    solutions = ((error, solve_pose(camera.zoomed(error), found, options, 0, plausible)) for error in _OTHERS)
+    return [
+        OtherFocalLength(error, solution.T_map_camera)
+        for error, solution in solutions
+        if solution and solution.inliers.sum() >= enough and plausible(solution.T_map_camera)
+    ]

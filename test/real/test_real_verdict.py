@@ -34,8 +34,9 @@ def test_a_wheel_that_agrees_does_not_hide_the_rest(scenes) -> None:
 @pytest.mark.parametrize(
     ("scene_name", "photo_name", "corruption", "seed", "says"),
     [
-        ("bonsai", "DSCF5813.jpg", "focal-10", 103, "the focal length fits 8.0 +- 2.0 % longer than calibrated"),
+        ("bonsai", "DSCF5813.jpg", "focal-10", 103, "the focal length fits 12.0 +- 2.0 % longer than calibrated"),
         ("office", "00175.jpg", "focal+10", 102, "the focal length fits 8.0 +- 2.0 % shorter than calibrated"),
+        ("office", "00175.jpg", "focal+10", 200, "the focal length fits 8.0 +- 2.0 % shorter than calibrated"),
     ],
 )
 def test_a_part_that_fits_by_a_wrong_focal_length_is_no_answer(
