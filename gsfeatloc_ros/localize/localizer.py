@@ -219,7 +219,11 @@ class Localizer:
         matched, small_options = small.match(found.pose[0]).found, _for_small(query, small)
         with query.clock.stage("verify"):
             others = other_focal_lengths(small.photo.camera, found.pose[0], matched, small_options, small.plausible)
-        most, error = max(_CLEARLY_MORE * found.view.inliers, found.view.inliers + _LEAST_MORE), 0.0
+        if not others:
+            return found
+        # The calibration's as of a render at the estimate, too: the last one may have been beside it.
+        inliers = max(found.view.inliers, query.track(found.pose[0]).inliers)
+        most, error = max(_CLEARLY_MORE * inliers, inliers + _LEAST_MORE), 0.0
         for other in others:
             view = replace(query, photo=query.photo.zoomed(other.error)).track(other.T_map_camera)
             if view.inliers > most:
