@@ -143,9 +143,7 @@ def _miscalibrate_focal(percent: float) -> Corruption:
     """Claim a focal length that is off; the photo stays as it is."""
 
     def miscalibrate(image: np.ndarray, camera: Camera, rng: np.random.Generator) -> tuple[np.ndarray, Camera]:
-        K = camera.K.copy()
-        K[[0, 1], [0, 1]] *= 1 + percent / 100
-        return image, replace(camera, K=K)
+        return image, camera.zoomed(percent / 100)
 
     return miscalibrate
 

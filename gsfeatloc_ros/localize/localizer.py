@@ -225,7 +225,7 @@ class Localizer:
         inliers = max(found.view.inliers, query.track(found.pose[0]).inliers)
         most, error = max(_CLEARLY_MORE * inliers, inliers + _LEAST_MORE), 0.0
         for other in others:
-            view = replace(query, photo=query.photo.zoomed(other.error)).track(other.T_map_camera)
+            view = query.zoomed(other.error).track(other.T_map_camera)
             if view.inliers > most:
                 most, error = view.inliers, other.error
         if error == 0.0:

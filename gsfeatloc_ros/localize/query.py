@@ -119,6 +119,11 @@ class Query:
         """Return the query of the same photo, at most `max_width` pixels wide."""
         return replace(self, photo=self.photo.limited(max_width))
 
+    def zoomed(self, error: float) -> Query:
+        """Return the query of the same photo as if its focal length were longer by this share; its corners are kept."""
+        components = replace(self.components, create_tracker=lambda photo, device: self.tracker)
+        return replace(self, components=components, photo=self.photo.zoomed(error))
+
     @cached_property
     def features(self) -> Sized:
         """The photo's features, as the matcher gives them."""
