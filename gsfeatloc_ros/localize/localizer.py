@@ -200,7 +200,7 @@ class Localizer:
             return found
         small, options, seen = search.small, self._components.options, (query.photo.camera, found.view.render)
         poses = poses_left_open(*seen, *found.pose, options.lift)
-        matched, small_options = small.match(found.pose[0]).found, _for_small(query, small)
+        matched, small_options = small.match(found.pose[0], same_way_up=True).found, _for_small(query, small)
         with query.clock.stage("verify"):
             by_features = solve_pose(small.photo.camera, matched, small_options, options.seed, small.plausible)
         if by_features:
@@ -216,7 +216,7 @@ class Localizer:
         is_known = options.limits.max_focal_error >= 1
         if is_known or not (found.pose and found.is_believed_by_a_part):
             return found
-        matched, small_options = small.match(found.pose[0]).found, _for_small(query, small)
+        matched, small_options = small.match(found.pose[0], same_way_up=True).found, _for_small(query, small)
         with query.clock.stage("verify"):
             others = other_focal_lengths(small.photo.camera, found.pose[0], matched, small_options, small.plausible)
         if not others:

@@ -16,6 +16,9 @@ from gsfeatloc_ros.localize.options import LocalizerOptions
 _MIN_VARIANCE_SHARE = 0.01
 # Cameras whose optical axes are no farther apart look the same way.
 _SAME_WAY = math.cos(math.radians(45.0))
+# A prior whose standard deviations about all axes are smaller knows which way is up: three of them are within what
+# features of pictures that are the same way up may be turned by.
+_MAX_SIGMA_OF_THE_WAY_UP = math.radians(20.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +71,11 @@ class Prior:
         if rotation[2, 2] < _SAME_WAY:
             return math.nan
         return math.degrees(math.atan2(rotation[1, 0] - rotation[0, 1], rotation[0, 0] + rotation[1, 1]))
+
+    @property
+    def knows_the_way_up(self) -> bool:
+        """Whether a photo from where it says is the same way up as the view from there."""
+        return bool(np.linalg.eigvalsh(self.covariance[3:, 3:])[-1] < _MAX_SIGMA_OF_THE_WAY_UP**2)
 
     @cached_property
     def _spread(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

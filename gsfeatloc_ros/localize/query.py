@@ -92,11 +92,11 @@ class Components:
 
 @dataclass
 class _LastRender:
-    """What was rendered last, and from which pose (4, 4); and what features say of it, if that was asked."""
+    """What was rendered last, and from which pose (4, 4); and what features say of it, by `same_way_up`, if asked."""
 
     pose: np.ndarray = field(default_factory=lambda: np.eye(4))
     render: Render | None = None
-    matched: MatchedView | None = None
+    matched: dict[bool, MatchedView] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,21 +145,23 @@ class Query:
         with self.clock.stage("track"):
             return self.components.create_tracker(self.photo, self.components.renderer.device)
 
-    def match(self, pose: np.ndarray) -> MatchedView:
+    def match(self, pose: np.ndarray, same_way_up: bool) -> MatchedView:
         """Render the map at a pose (4, 4), match its features with the photo's, lift the matches and solve.
 
-        Unless that is what was done last.
+        Unless that is what was done last. Where the photo is known to be the `same_way_up` as the render, other matches
+        are left out: a thing and its like upside down are told apart.
         """
         matcher, photo_features, render = self.components.matcher, self.features, self.render(pose)
-        if self._last_render.matched is not None:
-            return self._last_render.matched
+        if same_way_up in self._last_render.matched:
+            return self._last_render.matched[same_way_up]
         with self.clock.stage("features"):
             image = render.device_image()
             features = matcher.features(image)
         with self.clock.stage("match"):
-            matches = matcher.match(photo_features, features)
-        self._last_render.matched = self._solve(pose, render, image, matches)
-        return self._last_render.matched
+            matches = matcher.match(photo_features, features, same_way_up)
+        view = self._solve(pose, render, image, matches)
+        self._last_render.matched[same_way_up] = view
+        return view
 
     def track(self, pose: np.ndarray, blur: Blur | None = None) -> MatchedView:
         """Do the same where the pose is nearly the photo's: track the photo's corners to the render instead.
@@ -202,7 +204,7 @@ class Query:
         if last.render is None or not np.array_equal(last.pose, pose):
             with self.clock.stage("render"):
                 last.render = self.components.renderer.render(self.photo.camera, pose)
-            last.pose, last.matched = pose.copy(), None
+            last.pose, last.matched = pose.copy(), {}
         return last.render
 
     @cached_property

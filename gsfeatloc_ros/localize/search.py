@@ -94,7 +94,7 @@ class Search:
         tracked = len(self._tried)
         found: list[Correspondences] = []
         if self._prior is not None:
-            views = look(self.small, [self._prior.pose])
+            views = look(self.small, [self._prior.pose], self._prior.knows_the_way_up)
             yield from self._hints(views)
             found = [view.found for view in views]
         if self.small.components.index is not None:
@@ -102,6 +102,8 @@ class Search:
         # Once a pose that the prior holds for possible was refined, and is refused, others near it are no better.
         if self._prior is not None and not any(self._query.plausible(place.pose) for place in self._tried[tracked:]):
             yield from self._beside(self._prior, found)
+            if not self._tried[tracked:]:
+                yield from self._any_way_up(self._prior)
 
     @property
     def looked(self) -> str:
@@ -164,10 +166,14 @@ class Search:
             self._around += len(batch)
             self.views += len(batch)
             self.poses_looked_from += batch
-            views = look(self.small, batch)
+            views = look(self.small, batch, prior.knows_the_way_up)
             yield from self._hints(views)
             found += [view.found for view in views]
             yield from self._agreed(found)
+
+    def _any_way_up(self, prior: Prior) -> Iterator[np.ndarray]:
+        """Look at the prior for what it excludes and yield the pose: a camera may be mounted upside down."""
+        yield from self._hints([replace(self.small, plausible=lambda pose: True).match(prior.pose, same_way_up=False)])
 
     def _tracked(self, prior: Prior) -> Iterator[np.ndarray]:
         """Yield the prior's pose where the photo is there, or that to which it is tracked from there.
@@ -250,7 +256,7 @@ class Search:
         """Return the pose (4, 4) of the photo by a render at a suggested one; None where too little agrees."""
         if self._was_tried(pose):
             return None
-        view = self.small.match(pose)
+        view = self.small.match(pose, same_way_up=True)
         self.views += 1
         self.poses_looked_from.append(pose)
         self._saw(view)
@@ -284,17 +290,18 @@ class _Place:
         return float(np.median(np.linalg.norm(camera.project(there[ahead]) - camera.project(self.seen[ahead]), axis=1)))
 
 
-def look(query: Query, poses: Sequence[np.ndarray]) -> list[MatchedView]:
+def look(query: Query, poses: Sequence[np.ndarray], same_way_up: bool) -> list[MatchedView]:
     """Match a photo with views of the map and sort these by what they have in common with it.
 
     Args:
         query: the photo, at most SEARCH_WIDTH wide.
         poses: (4, 4) each, T_map_camera of the views.
+        same_way_up: whether the photo is known to be the same way up as they are.
 
     Returns:
         The views, those with the most inliers first.
     """
-    return sorted((query.match(pose) for pose in poses), key=lambda view: view.inliers, reverse=True)
+    return sorted((query.match(pose, same_way_up) for pose in poses), key=lambda view: view.inliers, reverse=True)
 
 
 def promising(views: Sequence[MatchedView]) -> list[MatchedView]:

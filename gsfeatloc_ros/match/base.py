@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sized
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol, TypeAlias, TypeVar
 
 import numpy as np
@@ -19,18 +19,21 @@ class Features:
         keypoints: (N, 2) float32 sub-pixel positions; the centre of the top-left pixel is (0, 0).
         descriptors: (N, D) float32, unit length.
         scores: (N,) float32, higher is better.
+        angles: (N,) float32 radians by which the descriptors are turned in the image; None where they are not.
     """
 
     keypoints: Array
     descriptors: Array
     scores: Array
+    angles: Array | None = field(default=None, kw_only=True)
 
     def __len__(self) -> int:
         return len(self.keypoints)
 
     def on_host(self) -> Features:
         """Return the same with numpy arrays."""
-        return Features(to_host(self.keypoints), to_host(self.descriptors), to_host(self.scores))
+        angles = None if self.angles is None else to_host(self.angles)
+        return Features(to_host(self.keypoints), to_host(self.descriptors), to_host(self.scores), angles=angles)
 
     @staticmethod
     def none(dimension: int) -> Features:
@@ -118,7 +121,8 @@ class Matcher(Protocol[F]):
     its length.
 
     Attributes:
-        upright: whether images match only the same way up, within some 45 degrees.
+        upright: whether images match only the same way up, within some 45 degrees; those of others do, within 60, if
+            they are asked to.
     """
 
     @property
@@ -128,6 +132,9 @@ class Matcher(Protocol[F]):
         """Extract the features of an RGB image (H, W, 3) uint8; of an image without any the length is 0."""
         ...
 
-    def match(self, a: F, b: F) -> Matches:
-        """Match the features of two images; empty features give no matches."""
+    def match(self, a: F, b: F, same_way_up: bool = False) -> Matches:
+        """Match the features of two images; empty features give no matches.
+
+        Where the images are known to be the `same_way_up`, what is turned against that is not looked at.
+        """
         ...

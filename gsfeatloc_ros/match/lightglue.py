@@ -104,7 +104,7 @@ class LightGlueMatcher:
         return PlacedFeatures(found.keypoints, found.descriptors, found.scores, (width, height))
 
     @torch.inference_mode()
-    def match(self, a: PlacedFeatures, b: PlacedFeatures) -> Matches:
+    def match(self, a: PlacedFeatures, b: PlacedFeatures, same_way_up: bool = False) -> Matches:
         """Match the features of two images."""
         if len(a) == 0 or len(b) == 0:
             return Matches.none()

@@ -61,7 +61,7 @@ class LoftrMatcher:
         return DenseFeatures(self._loftr.extract_features(rgb_to_grayscale(to_tensor(image, self._device))))
 
     @torch.inference_mode()
-    def match(self, a: DenseFeatures, b: DenseFeatures) -> Matches:
+    def match(self, a: DenseFeatures, b: DenseFeatures, same_way_up: bool = False) -> Matches:
         """Match two images."""
         if len(a) == 0 or len(b) == 0:
             return Matches.none()

@@ -13,6 +13,9 @@ from gsfeatloc_ros.match.nearest import match_mutual
 MIN_CONTRAST = 0.01
 # Of Lowe's test: distance to the nearest descriptor over that to the second nearest.
 MAX_DISTANCE_RATIO = 0.85
+# Where two images are the same way up, radians by which features that match may be turned: the camera by a third of it,
+# and what is seen from the side more.
+MAX_TURN = np.radians(60.0)
 
 
 class Sift:
@@ -36,8 +39,9 @@ class Sift:
             np.asarray(cv2.KeyPoint.convert(keypoints)),
             descriptors,
             np.array([k.response for k in keypoints], dtype=np.float32),
+            angles=np.radians(np.array([k.angle for k in keypoints], dtype=np.float32)),
         )
 
-    def match(self, a: Features, b: Features) -> Matches:
-        """Match the features of two images."""
-        return match_mutual(a, b, max_ratio=MAX_DISTANCE_RATIO)
+    def match(self, a: Features, b: Features, same_way_up: bool = False) -> Matches:
+        """Match the features of two images, of two that are the `same_way_up` those that are turned alike."""
+        return match_mutual(a, b, max_ratio=MAX_DISTANCE_RATIO, max_turn=MAX_TURN if same_way_up else np.pi)

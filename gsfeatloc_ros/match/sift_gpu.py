@@ -19,7 +19,7 @@ from torch.nn import functional
 from gsfeatloc_ros.common.arrays import Array, to_device
 from gsfeatloc_ros.match.base import Features, Matches
 from gsfeatloc_ros.match.nearest import match_mutual
-from gsfeatloc_ros.match.sift import MAX_DISTANCE_RATIO, MIN_CONTRAST
+from gsfeatloc_ros.match.sift import MAX_DISTANCE_RATIO, MAX_TURN, MIN_CONTRAST
 from gsfeatloc_ros.match.tensor import LUMA
 
 # Scale space: the image, enlarged twofold, has the first blur; every octave begins at the second and doubles it in so
@@ -190,11 +190,12 @@ class GpuSift:
         keypoints, angles = self._orient(keypoints, gradients, atlas)
         if len(angles) == 0:
             return self._none()
-        return Features(keypoints.pixels, self._describe(keypoints, angles, gradients, atlas), keypoints.scores)
+        descriptors = self._describe(keypoints, angles, gradients, atlas)
+        return Features(keypoints.pixels, descriptors, keypoints.scores, angles=angles)
 
-    def match(self, a: Features, b: Features) -> Matches:
-        """Match the features of two images."""
-        return match_mutual(a, b, max_ratio=MAX_DISTANCE_RATIO)
+    def match(self, a: Features, b: Features, same_way_up: bool = False) -> Matches:
+        """Match the features of two images, of two that are the `same_way_up` those that are turned alike."""
+        return match_mutual(a, b, max_ratio=MAX_DISTANCE_RATIO, max_turn=MAX_TURN if same_way_up else math.pi)
 
     def _none(self) -> Features:
         return Features(

@@ -56,6 +56,6 @@ class XFeatMatcher:
             centroid(peaks[inside], cell_heatmap(logits[0])), found["descriptors"][inside], found["scores"][inside]
         )
 
-    def match(self, a: Features, b: Features) -> Matches:
+    def match(self, a: Features, b: Features, same_way_up: bool = False) -> Matches:
         """Match the features of two images."""
         return match_mutual(a, b, min_similarity=_MIN_SIMILARITY)

@@ -114,14 +114,18 @@ def test_matches_of_a_turned_scaled_and_moved_picture_are_where_they_belong(angl
         borderMode=cv2.BORDER_REFLECT,
     )
 
-    def errors(sift: GpuSift | Sift) -> np.ndarray:
-        matches = sift.match(sift.features(image), sift.features(moved))
+    def errors(sift: GpuSift | Sift, same_way_up: bool = False) -> np.ndarray:
+        matches = sift.match(sift.features(image), sift.features(moved), same_way_up)
         return np.linalg.norm(matches.b - (matches.a @ move[:, :2].T + move[:, 2]), axis=1)
 
     ours, theirs = errors(on_cpu()), errors(Sift(2048))
     assert len(ours) > 0.9 * len(theirs) > 100
     assert (ours < 1.5).mean() > 0.9
     assert np.median(ours) < np.median(theirs) + 0.05
+    for sift, found in ((on_cpu(), ours), (Sift(2048), theirs)):
+        right = (errors(sift, same_way_up=True) < 1.5).sum() / (found < 1.5).sum()
+        assert abs(angle) > 45 or right > 0.95
+        assert abs(angle) < 75 or right < 0.05
 
 
 @pytest.mark.parametrize("move", [(0.5, 0.0), (0.25, -0.75), (3.4, -2.3)])
@@ -152,8 +156,9 @@ def test_pictures_on_the_device_stay_there_until_the_matches() -> None:
         b = sift.features(on_device)
         assert (gpu.to_host, gpu.to_device, gpu.waits) == ([], [], ["nonzero"]), gpu.explain()
         assert len(gpu.operations) < 260, gpu.explain()
-        gpu.reset()
-        matches = sift.match(a, b)
-        assert len(gpu.to_host) == len(gpu.waits) == 1, gpu.explain()
+        for same_way_up in (True, False):
+            gpu.reset()
+            matches = sift.match(a, b, same_way_up)
+            assert len(gpu.to_host) == len(gpu.waits) == 1, gpu.explain()
     np.testing.assert_array_equal(matches.a, wanted.a)
     np.testing.assert_array_equal(matches.b, wanted.b)

@@ -19,6 +19,7 @@ from gsfeatloc_ros.localize.evidence import (
     verdict,
     with_mirror,
 )
+from gsfeatloc_ros.localize.options import LocalizerOptions
 from gsfeatloc_ros.localize.prior import Prior
 from gsfeatloc_ros.localize.protection import protection_level
 
@@ -204,10 +205,10 @@ def test_more_agreement_never_makes_an_answer_less_probable(name: str, low: floa
 
 
 def test_probabilities_tell_what_was_seen_apart() -> None:
-    """As measured: a right answer, one in a photo that is covered by 40 %, lego's worst mirror image, a wrong pose."""
-    right = replace(GOOD, explained_inlier_ratio=0.985, correlation=0.94, low_correlation=0.88)
-    covered = replace(GOOD, explained_inlier_ratio=0.98, correlation=0.91, low_correlation=0.83)
-    mirrored = replace(GOOD, explained_inlier_ratio=0.969, correlation=0.83, low_correlation=0.705)
+    """As measured: a right answer, one in a photo that is covered by 60 %, lego's worst mirror image, a wrong pose."""
+    right = replace(GOOD, explained_inlier_ratio=0.99, correlation=0.943, low_correlation=0.89)
+    covered = replace(GOOD, explained_inlier_ratio=0.971, correlation=0.908, low_correlation=0.835)
+    mirrored = replace(GOOD, explained_inlier_ratio=0.968, correlation=0.808, low_correlation=0.703)
     wrong = replace(GOOD, explained_inlier_ratio=0.77, correlation=0.5, low_correlation=0.3)
     assert probability_wrong(right) < 1e-6
     assert probability_wrong(covered) < 1e-4 < 0.01 < probability_wrong(mirrored) < probability_wrong(wrong)
@@ -236,6 +237,21 @@ def test_roll_is_the_turn_about_the_axis_of_who_looks_the_same_way(roll: float, 
     pose = prior @ make_pose(so3_exp(across) @ so3_exp(np.array([0.0, 0.0, np.radians(roll)])), np.ones(3))
     found = Prior(prior, default, default, default).roll_deg(pose)
     assert found == pytest.approx(roll, abs=1e-6) if apart < 45.0 else np.isnan(found)
+
+
+def test_a_prior_knows_the_way_up_if_it_is_sure_about_each_axis() -> None:
+    default = LocalizerOptions().prior_covariance()
+
+    def knows(*degrees: float) -> bool:
+        turn = so3_exp(np.array([0.3, -0.4, 0.8]))
+        covariance = default.copy()
+        covariance[3:, 3:] = turn @ np.diag(np.radians(degrees) ** 2) @ turn.T
+        return Prior(np.eye(4), covariance, default, default).knows_the_way_up
+
+    assert Prior(np.eye(4), default, default, default).knows_the_way_up
+    assert knows(19.0, 19.0, 19.0)
+    assert knows(0.0, 0.0, 0.0)
+    assert not knows(1.0, 1.0, 21.0)
 
 
 def test_protection_levels_are_along_the_worst_axis() -> None:

@@ -93,7 +93,7 @@ def test_an_image_of_nothing_has_no_features(trained, value: int) -> None:
 
 def test_matches_are_pixels_of_the_two_images_with_a_score(matcher) -> None:
     a, b = (matcher.features(rectangles(*size)) for size in [(101, 203), (64, 96)])
-    for matches in (matcher.match(a, b), matcher.match(a, a)):
+    for matches in (matcher.match(a, b), matcher.match(a, a), matcher.match(a, a, same_way_up=True)):
         assert matches.a.shape == matches.b.shape == (len(matches), 2)
         assert matches.a.dtype == matches.b.dtype == matches.scores.dtype == np.float64
         assert ((matches.scores >= 0) & (matches.scores <= 1)).all()
@@ -190,29 +190,43 @@ def test_a_centroid_is_the_mean_of_the_window() -> None:
 # Nearest neighbours
 
 
-def described(descriptors: np.ndarray, array=np.asarray) -> Features:
+def described(descriptors: np.ndarray, array=np.asarray, angles: np.ndarray | None = None) -> Features:
     """Features with these descriptors, scaled to unit length, whose keypoints' x is their number."""
     descriptors = descriptors / np.linalg.norm(descriptors, axis=1, keepdims=True)
     keypoints = np.column_stack([np.arange(len(descriptors)), np.zeros(len(descriptors))])
-    return Features(*(array(part.astype(np.float32)) for part in (keypoints, descriptors, np.ones(len(descriptors)))))
+    parts = (array(part.astype(np.float32)) for part in (keypoints, descriptors, np.ones(len(descriptors))))
+    return Features(*parts, angles=None if angles is None else array(angles.astype(np.float32)))
 
 
+@pytest.mark.parametrize("max_turn", [np.pi, 1.0])
 @pytest.mark.parametrize("array", [np.asarray, torch.from_numpy])
-def test_mutual_matching_equals_the_definition(array) -> None:
+def test_mutual_matching_equals_the_definition(array, max_turn) -> None:
     rng = np.random.default_rng(0)
-    first, second = (described(rng.normal(size=(n, 8)), array) for n in (30, 40))
+    # More than once around: angles that differ by a whole turn are the same.
+    first, second = (described(rng.normal(size=(n, 8)), array, rng.uniform(-7, 7, n)) for n in (60, 80))
     a, b = (to_host(features.descriptors) for features in (first, second))
     distance = np.linalg.norm(a[:, None] - b[None], axis=2)
+    turns = to_host(first.angles)[:, None] - to_host(second.angles)
+    distance[np.abs(np.arctan2(np.sin(turns), np.cos(turns))) > max_turn] = np.inf
     expected = []
     for i in range(len(a)):
         nearest, runner_up = np.sort(distance[i])[:2]
         j = int(distance[i].argmin())
         if distance[:, j].argmin() == i and nearest < 0.9 * runner_up and 1 - nearest**2 / 2 >= 0.3:
             expected.append((i, j))
-    matches = match_mutual(first, second, min_similarity=0.3, max_ratio=0.9)
+    matches = match_mutual(first, second, min_similarity=0.3, max_ratio=0.9, max_turn=max_turn)
     assert len(expected) > 3
     assert list(zip(matches.a[:, 0], matches.b[:, 0], strict=True)) == expected
     np.testing.assert_allclose(matches.scores, [a[i] @ b[j] for i, j in expected], rtol=1e-5)
+
+
+@pytest.mark.parametrize("array", [np.asarray, torch.from_numpy])
+def test_features_that_are_all_turned_too_far_match_nothing(array) -> None:
+    same = np.random.default_rng(0).normal(size=(20, 8))
+    first, second = (described(same, array, np.full(20, angle)) for angle in (0.0, 3.0))
+    assert len(match_mutual(first, second)) == 20
+    assert len(match_mutual(first, second, max_turn=2.9)) == 0
+    assert len(match_mutual(first, second, max_turn=3.1)) == 20
 
 
 @pytest.mark.parametrize("array", [np.asarray, torch.from_numpy])

@@ -102,7 +102,7 @@ def small_query(renderer, camera, image: np.ndarray) -> Query:
 
 def seen(renderer, camera, image: np.ndarray, views: list[np.ndarray]) -> list[MatchedView]:
     """The views of the map from some poses, beside a photo."""
-    return look(small_query(renderer, camera, image), views)
+    return look(small_query(renderer, camera, image), views, same_way_up=False)
 
 
 def turned(pose: np.ndarray, degrees: float) -> np.ndarray:
@@ -132,7 +132,7 @@ def test_views_that_share_nothing_are_not_followed(renderer, room_camera, room_p
 def test_views_that_each_have_too_few_matches_agree_on_a_pose(renderer, room_camera, room_photos) -> None:
     photo = room_photos[0]
     query = small_query(renderer, room_camera, photo.image)
-    view = query.match(photo.T_map_camera)
+    view = query.match(photo.T_map_camera, same_way_up=True)
     agreeing = np.flatnonzero(view.solution.inliers)
     parts = [view.found.select(agreeing[start : start + 5]) for start in (0, 5, 10)]
     agreed = agreed_pose(query, parts)
@@ -145,7 +145,7 @@ def test_views_that_each_have_too_few_matches_agree_on_a_pose(renderer, room_cam
 def test_views_do_not_agree_on_a_pose_that_the_prior_excludes(renderer, room_camera, room_photos) -> None:
     photo = room_photos[0]
     query = small_query(renderer, room_camera, photo.image)
-    found = query.match(photo.T_map_camera).found
+    found = query.match(photo.T_map_camera, same_way_up=True).found
     assert agreed_pose(query, [found]) is not None
     assert agreed_pose(replace(query, plausible=lambda pose: False), [found]) is None
 
@@ -153,7 +153,33 @@ def test_views_do_not_agree_on_a_pose_that_the_prior_excludes(renderer, room_cam
 def test_views_without_matches_agree_on_nothing(renderer, room_camera, room_photos) -> None:
     photo = room_photos[0]
     query = small_query(renderer, room_camera, photo.image)
-    assert agreed_pose(query, [query.match(photo.T_map_camera).found.select([])]) is None
+    assert agreed_pose(query, [query.match(photo.T_map_camera, same_way_up=True).found.select([])]) is None
+
+
+def test_what_is_seen_a_second_time_upside_down_is_no_rival(renderer, room_camera, room_photos) -> None:
+    photo = room_photos[0]
+    height, width = (side // 2 for side in photo.image.shape[:2])
+    covered = photo.image.copy()
+    covered[-height:, -width:] = photo.image[:height, :width][::-1, ::-1]
+    query = small_query(renderer, room_camera, covered)
+    for other in (False, True, False):
+        query.match(photo.T_map_camera, other)  # which is kept
+    any_way, same_way = (query.match(photo.T_map_camera, same_way_up) for same_way_up in (False, True))
+    # Of the part that is seen twice any way finds one or the other.
+    half = np.array([query.photo.camera.width, query.photo.camera.height]) / 2
+
+    def inliers_there(view: MatchedView) -> int:
+        return int((view.correspondences.a < half).all(axis=1).sum())
+
+    assert inliers_there(same_way) > 1.2 * inliers_there(any_way) > 0
+    assert len(same_way.found.pixels) - same_way.inliers < len(any_way.found.pixels) - any_way.inliers
+
+
+def test_a_camera_upside_down_has_nothing_in_common_the_same_way_up(renderer, room_camera, room_photos) -> None:
+    photo = room_photos[0]
+    query = small_query(renderer, room_camera, np.ascontiguousarray(photo.image[::-1, ::-1]))
+    assert query.match(photo.T_map_camera, same_way_up=False).inliers > 50
+    assert query.match(photo.T_map_camera, same_way_up=True).inliers < 10
 
 
 @pytest.mark.slow
