@@ -11,7 +11,7 @@ from gsfeatloc_ros.common.kernels import njit
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def mean_rows(gray, factor):
-    """Return the means (h, W) float32 of every `factor` rows of brightness (h factor, W) uint8."""
+    """Return the means (h, W) float32 of every `factor` rows of a picture (h factor, W) uint8 or float32."""
     means = np.zeros((len(gray) // factor, gray.shape[1]), np.float32)
     for block in range(len(means)):
         mean = means[block]

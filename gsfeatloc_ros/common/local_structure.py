@@ -7,18 +7,24 @@ import numpy as np
 
 # What is smooth over a neighbourhood is computed in pictures so small that its standard deviation is three pixels.
 _SIGMA = 3.0
+# Where less of a neighbourhood counts, it is taken to be so much.
+_MIN_COUNTED = 1e-3
 
 
-def local_structure(gray: np.ndarray, neighbourhood: float, min_contrast: float) -> tuple[np.ndarray, np.ndarray]:
+def local_structure(
+    gray: np.ndarray, neighbourhood: float, min_contrast: float, counted: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Return brightness less its local mean, over its local standard deviation.
 
     Args:
         gray: (H, W) uint8.
         neighbourhood: standard deviation, in pixels, of the Gaussian window.
         min_contrast: what is divided by at least, of 255: noise on a blank wall is no structure.
+        counted: (H, W) bool, of which pixels mean and deviation are, and which have a structure; None for all. By what
+            lies beside them they are not changed (normalized convolution: Knutsson and Westin, 1993).
 
     Returns:
-        The structure (H, W) float32, and the local standard deviation (H, W) float32.
+        The structure (H, W) float32, 0 where pixels do not count, and the local standard deviation (H, W) float32.
     """
     # Not before the first: numba takes a second to load, and makes a folder.
     from gsfeatloc_ros.common.block_kernels import centre, divide, mean_rows
@@ -26,10 +32,24 @@ def local_structure(gray: np.ndarray, neighbourhood: float, min_contrast: float)
     height, width = gray.shape
     factor = max(1, int(neighbourhood / _SIGMA))
     sigma = neighbourhood / factor
-    gray = cv2.copyMakeBorder(gray, 0, -height % factor, 0, -width % factor, cv2.BORDER_REPLICATE)
-    structure, squares = centre(gray, _widened(_smooth(mean_rows(gray, factor), factor, sigma), factor), factor)
-    deviations = _widened(np.sqrt(_smooth(squares, factor, sigma)), factor)
-    contrast = divide(structure, deviations, factor, np.float32(min_contrast))
+
+    def padded(picture: np.ndarray) -> np.ndarray:
+        return cv2.copyMakeBorder(picture, 0, -height % factor, 0, -width % factor, cv2.BORDER_REPLICATE)
+
+    def mean(picture: np.ndarray) -> np.ndarray:
+        return _smooth(mean_rows(picture, factor), factor, sigma)
+
+    gray = padded(gray)
+    if counted is None:
+        structure, squares = centre(gray, _widened(mean(gray), factor), factor)
+        variance = _smooth(squares, factor, sigma)
+    else:
+        counts = padded(counted.astype(np.uint8))
+        share = np.maximum(mean(counts), _MIN_COUNTED)
+        structure, _ = centre(gray, _widened(mean(gray * counts) / share, factor), factor)
+        structure *= counts
+        variance = _smooth(mean_rows(structure**2, factor), factor, sigma) / share
+    contrast = divide(structure, _widened(np.sqrt(variance), factor), factor, np.float32(min_contrast))
     return structure[:height, :width], contrast[:height, :width]
 
 

@@ -32,8 +32,11 @@ _MIN_COVERED = 0.5
 # A cell is compared where so much of it is covered, and so much of that has contrast in one of the pictures.
 _MIN_COVERED_SHARE = 0.3
 _MIN_CONTRAST_SHARE = 0.5
-# Width, in compared pixels, of what is smoothed out of the mask of changes.
+# What is smoothed out of the mask of changes is narrower than so many compared pixels.
 _BRUSH = 7
+# What is wider than these, and not as in the map, was put there, or is gone: what lies beside it is judged without it.
+# Narrower is where a map is soft, or the pose is wrong.
+_MIN_WIDTH_OF_CHANGED = 21
 # Where the local structures of photo and render correlate less, the photo shows something else than the map.
 _MIN_CORRELATION = 0.5
 # Views differ where their local structures are farther apart than this; cells of this many pixels across vote, if they
@@ -53,6 +56,7 @@ class Comparison:
         render_inlier_ratio: the same of the render's corners in the photo; NaN where none was found.
         agreeing, disagreeing: (12, 16) number of corners of either in each cell of the photo.
         correlation: (12, 16) of the local structure of the two in each cell; NaN where there is nothing to compare.
+        correlation_beside_changes: the same without the wider parts of the photo that are not as in the map.
     """
 
     inlier_ratio: float
@@ -60,6 +64,7 @@ class Comparison:
     agreeing: np.ndarray
     disagreeing: np.ndarray
     correlation: np.ndarray
+    correlation_beside_changes: np.ndarray
 
     @property
     def explained_inlier_ratio(self) -> float:
@@ -67,13 +72,14 @@ class Comparison:
 
         What covers the photo disagrees elsewhere; a place that is only nearly the same disagrees among what agrees.
         """
-        alike = (self.agreeing > self.disagreeing) & (self.correlation >= _MIN_CORRELATION)
+        alike = (self.agreeing > self.disagreeing) & (self.correlation_beside_changes >= _MIN_CORRELATION)
         agreeing, disagreeing = self.agreeing[alike].sum(), self.disagreeing[alike].sum()
         return float((agreeing + 0.5) / (agreeing + disagreeing + 1)) if agreeing else float("nan")
 
     def explained_correlation(self, quantile: float) -> float:
         """Return a quantile of the correlation over the cells in which most corners agree; NaN without any."""
-        values = self.correlation[(self.agreeing > self.disagreeing) & np.isfinite(self.correlation)]
+        correlation = self.correlation_beside_changes
+        values = correlation[(self.agreeing > self.disagreeing) & np.isfinite(correlation)]
         return float(np.quantile(values, quantile)) if len(values) else float("nan")
 
     def changed_share(self) -> float:
@@ -95,7 +101,11 @@ def compare(
         back = query.tracker.track_back(view.image, lambda pixels: lifted(pixels).valid)
         found = query.correspondences(back.a, lifted(back.b), view.pose)
     with query.clock.stage("verify"):
-        correlation = _correlation(query.photo, view)
+        pair = _Pair.of(query.photo, view)
+        structures = pair.structures(pair.covered)
+        correlation = beside_changes = structures.correlation()
+        if (changed := structures.changed(_MIN_WIDTH_OF_CHANGED)).any():
+            beside_changes = pair.structures(pair.covered & ~changed).correlation()
     agrees, agrees_back = errors(view.found) <= tolerance, errors(found) <= tolerance
     pixels, all_agree = np.concatenate([view.found.pixels, found.pixels]), np.concatenate([agrees, agrees_back])
     return Comparison(
@@ -104,6 +114,7 @@ def compare(
         agreeing=_count(pixels[all_agree], camera),
         disagreeing=_count(pixels[~all_agree], camera),
         correlation=correlation,
+        correlation_beside_changes=beside_changes,
     )
 
 
@@ -113,10 +124,9 @@ def preference(photo: Photo, a: MatchedView, b: MatchedView) -> float:
     Only where the two views differ they are compared with the photo, cell by cell; a pixel more or less in the estimate
     is no difference. Each cell has one vote.
     """
-    structures, masks = zip(*((s[1], s[3]) for s in (_structures(photo, view) for view in (a, b))), strict=True)
-    seen = _structures(photo, a)[0]
-    apart = masks[0] & masks[1] & (_least_difference(structures[0], structures[1]) > _MIN_DIFFERENCE)
-    lead = _least_difference(seen, structures[1]) - _least_difference(seen, structures[0])
+    of_a, of_b = (pair.structures(pair.covered) for pair in (_Pair.of(photo, view) for view in (a, b)))
+    apart = of_a.counted & of_b.counted & (_least_difference(of_a.render, of_b.render) > _MIN_DIFFERENCE)
+    lead = _least_difference(of_a.photo, of_b.render) - _least_difference(of_a.photo, of_a.render)
     height, width = (side // _VOTING_CELL * _VOTING_CELL for side in apart.shape)
 
     def total(values: np.ndarray) -> np.ndarray:
@@ -135,17 +145,8 @@ def _least_difference(fixed: np.ndarray, moved: np.ndarray) -> np.ndarray:
 
 def changed_mask(photo: Photo, view: MatchedView) -> np.ndarray:
     """Return where the photo shows something else than the map: (H, W) uint8, 255 there and 0 elsewhere."""
-    structure_photo, structure_map, compared, _ = _structures(photo, view)
-    sums = (
-        cv2.GaussianBlur(np.where(compared, values, 0).astype(np.float32), (0, 0), 0.5 * _NEIGHBOURHOOD)
-        for values in (structure_photo * structure_map, structure_photo**2, structure_map**2)
-    )
-    product, square_photo, square_map = sums
-    alike = product >= _MIN_CORRELATION * np.sqrt(square_photo * square_map)
-    changed = (compared & ~alike).astype(np.uint8) * 255
-    # Specks and gaps narrower than what is compared mean nothing.
-    brush = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (_BRUSH, _BRUSH))
-    changed = cv2.morphologyEx(cv2.morphologyEx(changed, cv2.MORPH_CLOSE, brush), cv2.MORPH_OPEN, brush)
+    pair = _Pair.of(photo, view)
+    changed = pair.structures(pair.covered).changed(_BRUSH).astype(np.uint8) * 255
     return cv2.resize(changed, (photo.camera.width, photo.camera.height), interpolation=cv2.INTER_NEAREST)
 
 
@@ -157,35 +158,89 @@ def _count(pixels: np.ndarray, camera: Camera) -> np.ndarray:
     return np.bincount(rows * across + columns, minlength=across * down).reshape(down, across)
 
 
-def _structures(photo: Photo, view: MatchedView) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the local structure of photo and render, where they are covered and have contrast, and where covered."""
-    camera = photo.camera
-    scale = min(1.0, _FOCAL_LENGTH / camera.K[0, 0])
-    size = (max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
-    covered = photo.seen & (to_host(view.render.alpha) >= _MIN_ALPHA)
-    # As bytes, of which that is a whole number.
-    covered = shrunk(covered * np.uint8(200), *size) > 200 * _MIN_COVERED
-    (photo_structure, photo_contrast), (map_structure, map_contrast) = (
-        local_structure(shrunk(gray, *size), _NEIGHBOURHOOD, _MIN_CONTRAST)
-        for gray in (photo.gray(), cv2.cvtColor(to_host(view.image), cv2.COLOR_RGB2GRAY))
-    )
-    compared = covered & (np.maximum(photo_contrast, map_contrast) >= _MIN_CONTRAST)
-    return photo_structure, map_structure, compared, covered
+@dataclass(frozen=True, eq=False)
+class _Pair:
+    """Photo and render as they are compared.
+
+    Attributes:
+        photo, render: (H, W) uint8 brightness.
+        covered: (H, W) bool, where the map covers the photo and the lens sees.
+    """
+
+    photo: np.ndarray
+    render: np.ndarray
+    covered: np.ndarray
+
+    @staticmethod
+    def of(photo: Photo, view: MatchedView) -> _Pair:
+        """Make both as small as they are compared."""
+        camera = photo.camera
+        scale = min(1.0, _FOCAL_LENGTH / camera.K[0, 0])
+        size = (max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
+        covered = photo.seen & (to_host(view.render.alpha) >= _MIN_ALPHA)
+        return _Pair(
+            shrunk(photo.gray(), *size),
+            shrunk(cv2.cvtColor(to_host(view.image), cv2.COLOR_RGB2GRAY), *size),
+            # As bytes, of which that is a whole number.
+            shrunk(covered * np.uint8(200), *size) > 200 * _MIN_COVERED,
+        )
+
+    def structures(self, counted: np.ndarray) -> _Structures:
+        """Return the local structures of both where pixels (H, W) bool count: others say nothing about these."""
+        (photo, photo_contrast), (render, render_contrast) = (
+            local_structure(gray, _NEIGHBOURHOOD, _MIN_CONTRAST, counted) for gray in (self.photo, self.render)
+        )
+        compared = counted & (np.maximum(photo_contrast, render_contrast) >= _MIN_CONTRAST)
+        return _Structures(photo, render, counted, compared)
 
 
-def _correlation(photo: Photo, view: MatchedView) -> np.ndarray:
-    """Return the correlation (12, 16) of photo and render in each cell; NaN where there is nothing to compare."""
-    a, b, compared, covered = _structures(photo, view)
-    a, b = (np.where(covered, structure, np.float32(0)) for structure in (a, b))
-    rows, columns = _cells(*a.shape)
+@dataclass(frozen=True, eq=False)
+class _Structures:
+    """The local structures of photo and render.
 
-    def total(values: np.ndarray) -> np.ndarray:
-        return (rows @ values.astype(np.float32, copy=False) @ columns).astype(np.float64)
+    Attributes:
+        photo, render: (H, W) float32, 0 where pixels do not count.
+        counted: (H, W) bool, where they do.
+        compared: (H, W) bool, where there also is contrast in one of the two.
+    """
 
-    area, covered_area = a.size / (CELLS[0] * CELLS[1]), total(covered)
-    enough = (covered_area >= _MIN_COVERED_SHARE * area) & (total(compared) >= _MIN_CONTRAST_SHARE * covered_area)
-    correlation = total(a * b) / np.sqrt(np.maximum(total(a * a) * total(b * b), np.finfo(np.float64).tiny))
-    return np.where(enough & (covered_area > 0), correlation, np.nan)
+    photo: np.ndarray
+    render: np.ndarray
+    counted: np.ndarray
+    compared: np.ndarray
+
+    def correlation(self) -> np.ndarray:
+        """Return the correlation (12, 16) of the two in each cell; NaN where there is nothing to compare."""
+        rows, columns = _cells(*self.photo.shape)
+
+        def total(values: np.ndarray) -> np.ndarray:
+            return (rows @ values.astype(np.float32, copy=False) @ columns).astype(np.float64)
+
+        area, counted_area = self.photo.size / (CELLS[0] * CELLS[1]), total(self.counted)
+        enough = (counted_area >= _MIN_COVERED_SHARE * area) & (
+            total(self.compared) >= _MIN_CONTRAST_SHARE * counted_area
+        )
+        squares = total(self.photo * self.photo) * total(self.render * self.render)
+        correlation = total(self.photo * self.render) / np.sqrt(np.maximum(squares, np.finfo(np.float64).tiny))
+        return np.where(enough & (counted_area > 0), correlation, np.nan)
+
+    def changed(self, min_width: int) -> np.ndarray:
+        """Return where the photo shows something else than the map, in parts at least so many pixels wide: (H, W)."""
+        # What is smooth is computed at half the size.
+        height, width = self.photo.shape
+        half = (-(-width // 2), -(-height // 2))
+        photo, render = (np.where(self.compared, structure, np.float32(0)) for structure in (self.photo, self.render))
+        product, square_photo, square_render = (
+            cv2.GaussianBlur(cv2.resize(values, half, interpolation=cv2.INTER_AREA), (0, 0), 0.25 * _NEIGHBOURHOOD)
+            for values in (photo * render, photo**2, render**2)
+        )
+        alike = product >= _MIN_CORRELATION * np.sqrt(square_photo * square_render)
+        compared = cv2.resize(self.compared.astype(np.uint8), half, interpolation=cv2.INTER_NEAREST)
+        changed = np.where(alike, np.uint8(0), compared)
+        for operation, side in ((cv2.MORPH_CLOSE, _BRUSH), (cv2.MORPH_OPEN, min_width)):
+            brush = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side // 2 | 1, side // 2 | 1))
+            changed = cv2.morphologyEx(changed, operation, brush)
+        return cv2.resize(changed, (width, height), interpolation=cv2.INTER_NEAREST) > 0
 
 
 @lru_cache(maxsize=4)

@@ -44,8 +44,8 @@ MUCH_CHANGED = 0.3
 """Where more of the photo than this is not as in the map, it is asked whether something else explains that."""
 # The weights of what tells right from wrong answers (docs/trust.md), and what their sum is shifted and scaled by to be
 # the logarithm of the odds that the answer is wrong. The ratio counts by its logit, correlations by Fisher's z.
-_WEIGHTS = {"explained_inlier_ratio": -4.31, "correlation": -5.34, "low_correlation": -7.14}
-_OFFSET, _SLOPE = 27.54, 4.6
+_WEIGHTS = {"explained_inlier_ratio": -1.99, "correlation": -7.86, "low_correlation": -7.73}
+_OFFSET, _SLOPE = 22.72, 4.26
 # How numbers are written as texts, if not with three decimals.
 _FORMATS = {"probability_wrong": ".1e", "mirror_probability_wrong": ".1e", "focal_error": ".4f", "focal_sigma": ".4f"}
 # No photo is taken to say more.
@@ -69,7 +69,8 @@ class Evidence:
         explained_inlier_ratio: the same of both in the cells of the photo that look as in the map, half a corner of
             each kind added: of few corners less is known.
         coverage: share of the photo's cells, in a grid of 8 x 6, that hold an inlier.
-        correlation: median correlation, in [-1, 1], of photo and render in the cells whose corners agree.
+        correlation: median correlation, in [-1, 1], of photo and render in the cells whose corners agree, without the
+            wider parts of the photo that are not as in the map.
         low_correlation: that which a quarter of these cells do not reach.
         changed: share of the photo in which it shows something else than the map.
         reprojection_error_px: RMS of the inliers' reprojection errors in pixels of the localized photo.

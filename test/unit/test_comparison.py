@@ -84,14 +84,38 @@ def test_what_is_covered_is_told_apart(components, room_camera, room_photos) -> 
     assert comparison.explained_inlier_ratio > 0.97 > comparison.inlier_ratio
 
 
+def test_what_lies_beside_a_cover_is_as_without_it(components, room_camera, room_photos) -> None:
+    photo = room_photos[0]
+    usual, *_ = compared(components, photo.image, room_camera, photo.T_map_camera)
+    comparison, *_ = compared(components, covered(photo.image), room_camera, photo.T_map_camera)
+    compared_beside = np.isfinite(comparison.correlation_beside_changes)
+    # Cells that the edge of the cover cuts are compared by what is left of them.
+    cut = compared_beside & (comparison.correlation < usual.correlation - 0.1)
+    assert cut.sum() >= 10
+    assert np.median(comparison.correlation[cut]) < 0.7
+    assert np.median((comparison.correlation_beside_changes - usual.correlation)[cut]) > -0.05
+    # Most of what is covered is compared with nothing.
+    assert compared_beside.sum() < np.isfinite(comparison.correlation).sum() - 20
+
+
+def test_what_differs_in_small_parts_counts(components, room_camera, room_photos) -> None:
+    photo = room_photos[0]
+    speckled = photo.image.copy()
+    for y, x in np.random.default_rng(0).uniform([0, 0], [460, 620], (300, 2)).astype(int):
+        speckled[y : y + 20, x : x + 20] = speckled[y : y + 20, x : x + 20][::-1, ::-1]
+    usual, *_ = compared(components, photo.image, room_camera, photo.T_map_camera)
+    comparison, *_ = compared(components, speckled, room_camera, photo.T_map_camera)
+    assert comparison.explained_correlation(0.5) < usual.explained_correlation(0.5) - 0.1
+
+
 def test_what_disagrees_among_what_agrees_is_told_apart() -> None:
     agreeing, disagreeing, correlation = np.full((12, 16), 8), np.full((12, 16), 2), np.full((12, 16), 0.9)
-    scattered = Comparison(0.8, 0.8, agreeing, disagreeing, correlation)
+    scattered = Comparison(0.8, 0.8, agreeing, disagreeing, correlation, correlation)
     assert scattered.explained_inlier_ratio == pytest.approx(0.8, abs=1e-3)
     # The same numbers, all of what disagrees in one part.
     agreeing[:, 13:], disagreeing[:, :13], correlation[:, 13:] = 0, 0, 0.1
-    assert Comparison(0.8, 0.8, agreeing, disagreeing, correlation).explained_inlier_ratio > 0.999
-    assert np.isnan(Comparison(0.0, 0.0, 0 * agreeing, disagreeing, correlation).explained_inlier_ratio)
+    assert Comparison(0.8, 0.8, agreeing, disagreeing, correlation, correlation).explained_inlier_ratio > 0.999
+    assert np.isnan(Comparison(0.0, 0.0, 0 * agreeing, disagreeing, correlation, correlation).explained_inlier_ratio)
 
 
 def test_the_same_in_a_small_photo(components, room_camera, room_photos) -> None:
