@@ -48,7 +48,7 @@ def local_structure(
         share = np.maximum(mean(counts), _MIN_COUNTED)
         structure, _ = centre(gray, _widened(mean(gray * counts) / share, factor), factor)
         structure *= counts
-        variance = _smooth(mean_rows(structure**2, factor), factor, sigma) / share
+        variance = mean(structure**2) / share
     contrast = divide(structure, _widened(np.sqrt(variance), factor), factor, np.float32(min_contrast))
     return structure[:height, :width], contrast[:height, :width]
 
