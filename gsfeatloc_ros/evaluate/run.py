@@ -61,7 +61,7 @@ class Run:
         max_width: wider photos are resized to this many pixels.
         options: parameters of LocalizerOptions that differ from the default, with their values.
         ablation: the one of ABLATIONS that is taken out, or "".
-        corruption: the one of CORRUPTIONS that is done to the photos, or "".
+        corruption: the one of CORRUPTIONS that is done to the photos, negatives too, or "".
         degradation: the one of DEGRADATIONS that is done to the map, or "".
         negative: what the photos are in place of the scene's own: one of NEGATIVES, the folder of another scene, or "".
         index: the one of INDICES in which method "default" looks for what the prior does not show.
@@ -283,12 +283,13 @@ def _open(task: Task) -> tuple[Scene, tuple[np.ndarray, Camera]]:
     scene = open_scene(run.scene, run.map_path, task.version)
     if run.negative:
         negative = _negatives(run, task.version)[task.photo]
-        return scene, (negative.read(), negative.camera)
-    photo = scene.photos[task.prior.photo]
-    image = scene.read_photo(photo)
+        image, camera = negative.read(), negative.camera
+    else:
+        photo = scene.photos[task.prior.photo]
+        image, camera = scene.read_photo(photo), photo.camera
     if run.corruption:
-        return scene, corrupt(run.corruption, image, photo.camera, (run.seed, task.prior.photo))
-    return scene, (image, photo.camera)
+        return scene, corrupt(run.corruption, image, camera, (run.seed, task.prior.photo))
+    return scene, (image, camera)
 
 
 @lru_cache(maxsize=1)

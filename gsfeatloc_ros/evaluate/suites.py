@@ -22,7 +22,7 @@ class Condition:
     Attributes:
         protocol: how priors are made wrong, as in Run.
         corruption, degradation: as in Run.
-        negative: as in Run, or OTHER_SCENES.
+        negative: as in Run, or OTHER_SCENES; corrupted as well where both are named.
     """
 
     protocol: str = "paper"
@@ -37,6 +37,9 @@ class Condition:
         return [str(other) for other in scenes if other != scene]
 
 
+# What makes the mirror image of a nearly symmetric thing look more like the thing: detail is lost, or little is left.
+_DONE_TO_MIRRORED = ("motion-25", "defocus", "cover-40", "blobs", "small-160", "small-80", "crop")
+
 SUITES: dict[str, tuple[Condition, ...]] = {
     "trust": (
         Condition(),
@@ -44,6 +47,7 @@ SUITES: dict[str, tuple[Condition, ...]] = {
         *(Condition(corruption=name) for name in CORRUPTIONS),
         *(Condition(degradation=name) for name in DEGRADATIONS),
         *(Condition(negative=name) for name in (*NEGATIVES, OTHER_SCENES)),
+        *(Condition(negative="mirrored", corruption=name) for name in _DONE_TO_MIRRORED),
     )
 }
 """By name: whether answers can be trusted."""

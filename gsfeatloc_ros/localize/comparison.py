@@ -11,6 +11,7 @@ import numpy as np
 
 from gsfeatloc_ros.common.arrays import to_host
 from gsfeatloc_ros.common.camera import Camera
+from gsfeatloc_ros.common.doubt import fisher_z
 from gsfeatloc_ros.common.local_structure import local_structure
 from gsfeatloc_ros.common.photo import Photo
 from gsfeatloc_ros.common.shrink import shrunk
@@ -28,6 +29,8 @@ _NEIGHBOURHOOD = 12.0
 _MIN_CONTRAST = 2.0
 # Pixels that are compared must be covered by the map, and seen by the lens.
 _MIN_ALPHA = 0.9
+# Where it has less, the map shows nothing.
+_MIN_ALPHA_OF_MAP = 0.5
 _MIN_COVERED = 0.5
 # A cell is compared where so much of it is covered, and so much of that has contrast in one of the pictures.
 _MIN_COVERED_SHARE = 0.3
@@ -57,6 +60,7 @@ class Comparison:
         agreeing, disagreeing: (12, 16) number of corners of either in each cell of the photo.
         correlation: (12, 16) of the local structure of the two in each cell; NaN where there is nothing to compare.
         correlation_beside_changes: the same without the wider parts of the photo that are not as in the map.
+        beyond_map: share of the photo's corners that are where the map shows nothing; NaN without any.
     """
 
     inlier_ratio: float
@@ -65,6 +69,7 @@ class Comparison:
     disagreeing: np.ndarray
     correlation: np.ndarray
     correlation_beside_changes: np.ndarray
+    beyond_map: float
 
     @property
     def explained_inlier_ratio(self) -> float:
@@ -76,17 +81,31 @@ class Comparison:
         agreeing, disagreeing = self.agreeing[alike].sum(), self.disagreeing[alike].sum()
         return float((agreeing + 0.5) / (agreeing + disagreeing + 1)) if agreeing else float("nan")
 
-    def explained_correlation(self, quantile: float) -> float:
-        """Return a quantile of the correlation over the cells in which most corners agree; NaN without any."""
+    @property
+    def explained_correlation(self) -> float:
+        """Mean correlation, by Fisher's z, of the cells in which most corners agree; NaN without any."""
         correlation = self.correlation_beside_changes
         values = correlation[(self.agreeing > self.disagreeing) & np.isfinite(correlation)]
-        return float(np.quantile(values, quantile)) if len(values) else float("nan")
+        return float(np.tanh(fisher_z(values).mean())) if len(values) else float("nan")
 
-    def changed_share(self) -> float:
-        """Return the share of the compared cells in which the photo shows something else than the map; NaN for none."""
+    @property
+    def changed(self) -> float:
+        """Share of the compared cells in which the photo shows something else than the map; NaN for none."""
         compared = np.isfinite(self.correlation)
-        changed = (self.correlation < _MIN_CORRELATION) | (self.disagreeing > self.agreeing)
-        return float(changed[compared].mean()) if compared.any() else float("nan")
+        return float(self._differs(self.correlation)[compared].mean()) if compared.any() else float("nan")
+
+    @property
+    def scattered(self) -> float:
+        """Share of such cells beside the wider changes (Jeffreys' estimate); NaN where nothing is compared.
+
+        What covers the photo lies together; a place that is only nearly the same differs here and there.
+        """
+        compared = np.isfinite(self.correlation_beside_changes)
+        differing = self._differs(self.correlation_beside_changes)[compared].sum()
+        return float((differing + 0.5) / (compared.sum() + 1)) if compared.any() else float("nan")
+
+    def _differs(self, correlation: np.ndarray) -> np.ndarray:
+        return (correlation < _MIN_CORRELATION) | (self.disagreeing > self.agreeing)
 
 
 def compare(
@@ -115,6 +134,7 @@ def compare(
         disagreeing=_count(pixels[~all_agree], camera),
         correlation=correlation,
         correlation_beside_changes=beside_changes,
+        beyond_map=_share_beyond(query.tracker.corners, to_host(view.render.alpha)),
     )
 
 
@@ -148,6 +168,12 @@ def changed_mask(photo: Photo, view: MatchedView) -> np.ndarray:
     pair = _Pair.of(photo, view)
     changed = pair.structures(pair.covered).changed(_BRUSH).astype(np.uint8) * 255
     return cv2.resize(changed, (photo.camera.width, photo.camera.height), interpolation=cv2.INTER_NEAREST)
+
+
+def _share_beyond(corners: np.ndarray, alpha: np.ndarray) -> float:
+    """Return the share of corners (N, 2) that lie where a map's alpha (H, W) is small; NaN without any."""
+    columns, rows = np.rint(corners).astype(int).T
+    return float((alpha[rows, columns] < _MIN_ALPHA_OF_MAP).mean()) if len(corners) else float("nan")
 
 
 def _count(pixels: np.ndarray, camera: Camera) -> np.ndarray:

@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
+from gsfeatloc_ros.common.doubt import fisher_z, logit
 from gsfeatloc_ros.common.parameter import parameter
 
 # Coverage is counted in this many cells across and down the photo.
@@ -26,6 +27,9 @@ _NO_MIRROR = 1e-2
 # Of a pose that no prior expects the first share of the risk is taken, or the second where that was seen to.
 _UNEXPECTED = 1e-8
 _UNEXPECTED_NO_MIRROR = 1e-2
+# A wall seen from behind looks as its mirror image does, and from there most of the photo is of nothing in the map. If
+# more of its corners than this are beyond the map, and its mirror image was not seen to be none, nothing is risked.
+_MAX_BEYOND_MAP = 0.25
 # And this share of one that a prior expects if the mirror image suggests what is less likely to be wrong.
 _MIRRORED = 1e-4
 # What is seen in a picture on a wall or in a mirror, or is one of several, may be somewhere else: at most this share of
@@ -43,15 +47,14 @@ _MIN_INLIER_RATIO, _MIN_INLIER_RATIO_OF_CHANGED = 0.8, 0.65
 MUCH_CHANGED = 0.3
 """Where more of the photo than this is not as in the map, it is asked whether something else explains that."""
 # The weights of what tells right from wrong answers (docs/trust.md), and what their sum is shifted and scaled by to be
-# the logarithm of the odds that the answer is wrong. The ratio counts by its logit, correlations by Fisher's z.
-_WEIGHTS = {"explained_inlier_ratio": -1.99, "correlation": -7.86, "low_correlation": -7.73}
-_OFFSET, _SLOPE = 22.72, 4.26
+# the logarithm of the odds that the answer is wrong. Shares count by their logit, the correlation by Fisher's z, and
+# blur in degrees: in what is blurred there is less to tell right from wrong by.
+_WEIGHTS = {"explained_inlier_ratio": -1.58, "correlation": -15.74, "scattered": 1.58, "blur": 2.90}
+_OFFSET, _SLOPE = 27.11, 2.93
 # How numbers are written as texts, if not with three decimals.
 _FORMATS = {"probability_wrong": ".1e", "mirror_probability_wrong": ".1e", "focal_error": ".4f", "focal_sigma": ".4f"}
 # No photo is taken to say more.
 _LEAST_PROBABILITY = 1e-15
-# Ratios and correlations are taken to be no nearer to 1 than this.
-_MIN_DOUBT = 0.005
 
 
 @dataclass(frozen=True)
@@ -69,10 +72,12 @@ class Evidence:
         explained_inlier_ratio: the same of both in the cells of the photo that look as in the map, half a corner of
             each kind added: of few corners less is known.
         coverage: share of the photo's cells, in a grid of 8 x 6, that hold an inlier.
-        correlation: median correlation, in [-1, 1], of photo and render in the cells whose corners agree, without the
+        correlation: mean correlation, in [-1, 1], of photo and render in the cells whose corners agree, without the
             wider parts of the photo that are not as in the map.
-        low_correlation: that which a quarter of these cells do not reach.
-        changed: share of the photo in which it shows something else than the map.
+        scattered: share of the photo beside these parts in which it shows something else than the map, half a cell of
+            each kind added.
+        changed: share of the whole photo in which it does.
+        beyond_map: share of the photo's corners that are where the map shows nothing.
         reprojection_error_px: RMS of the inliers' reprojection errors in pixels of the localized photo.
         deviation: distance of the pose from the prior in standard deviations of the prior.
         roll_deg: by how many degrees the pose is turned about the optical axis against a prior that looks the same way.
@@ -100,8 +105,9 @@ class Evidence:
     explained_inlier_ratio: float = float("nan")
     coverage: float = 0.0
     correlation: float = float("nan")
-    low_correlation: float = float("nan")
+    scattered: float = float("nan")
     changed: float = float("nan")
+    beyond_map: float = float("nan")
     reprojection_error_px: float = float("nan")
     deviation: float = float("nan")
     roll_deg: float = float("nan")
@@ -229,7 +235,9 @@ def _share_of_risk(evidence: Evidence, limits: Limits) -> float:
     wrong, mirror_wrong = evidence.probability_wrong, evidence.mirror_probability_wrong
     if evidence.deviation <= limits.max_deviation:
         return _MIRRORED if mirror_wrong < wrong else 1.0
-    return _UNEXPECTED_NO_MIRROR if _is_no_mirror_image(evidence) else _UNEXPECTED
+    if _is_no_mirror_image(evidence):
+        return _UNEXPECTED_NO_MIRROR
+    return _UNEXPECTED if evidence.beyond_map <= _MAX_BEYOND_MAP else 0.0
 
 
 def _is_no_mirror_image(evidence: Evidence) -> bool:
@@ -243,6 +251,9 @@ def _why_so_little_risk(evidence: Evidence, limits: Limits) -> str:
         return ""
     if evidence.mirror_probability_wrong < 1 and not _is_no_mirror_image(evidence):
         return ", for the photo's mirror image fits about as well: is the image flipped?"
+    if not evidence.beyond_map <= _MAX_BEYOND_MAP:
+        nothing = f", for the map shows nothing of {evidence.beyond_map:.0%} of the photo"
+        return nothing + _why_unexpected(evidence, limits)
     return _why_unexpected(evidence, limits)
 
 
@@ -292,15 +303,17 @@ def unseen_focal_error(evidence: Evidence) -> float:
     return _MAX_FOCAL_ERROR + _UNSEEN_FOCAL_SIGMAS * evidence.focal_sigma
 
 
-def probability_wrong(evidence: Evidence) -> float:
+def probability_wrong(evidence: Evidence, focal_length: float) -> float:
     """Return the probability that a pose with this evidence is wrong, NaN where that cannot be said.
+
+    The focal length, in pixels, is that of the localized photo.
 
     A logistic regression on right answers (also of photos that are badly lit, blurred or covered) and on wrong poses
     that matched well (mirror images of a nearly symmetric object); see docs/trust.md for how far it can be trusted.
     """
-    ratio = np.clip(evidence.explained_inlier_ratio, _MIN_DOUBT, 1 - _MIN_DOUBT)
-    correlations = np.clip([evidence.correlation, evidence.low_correlation], _MIN_DOUBT - 1, 1 - _MIN_DOUBT)
-    values = np.array([np.log(ratio / (1 - ratio)), *np.arctanh(correlations)])
+    agreeing, scattered = logit(np.array([evidence.explained_inlier_ratio, evidence.scattered]))
+    blur_deg = np.degrees(evidence.blur_px / focal_length)
+    values = np.array([agreeing, fisher_z(evidence.correlation), scattered, blur_deg])
     log_odds = _SLOPE * (_OFFSET + values @ list(_WEIGHTS.values()))
     return float(np.maximum(1 / (1 + np.exp(-log_odds)), _LEAST_PROBABILITY))
 

@@ -304,9 +304,10 @@ class Localizer:
                 render_inlier_ratio=comparison.render_inlier_ratio,
                 explained_inlier_ratio=comparison.explained_inlier_ratio,
                 coverage=coverage(view.correspondences.a, camera.width, camera.height),
-                correlation=comparison.explained_correlation(0.5),
-                low_correlation=comparison.explained_correlation(0.25),
-                changed=comparison.changed_share(),
+                correlation=comparison.explained_correlation,
+                scattered=comparison.scattered,
+                changed=comparison.changed,
+                beyond_map=comparison.beyond_map,
                 reprojection_error_px=view.solution.reprojection_error,
                 deviation=prior.deviation(pose) if prior else float("nan"),
                 roll_deg=prior.roll_deg(pose) if prior else float("nan"),
@@ -314,7 +315,7 @@ class Localizer:
                 focal_error=fit.focal if fit else float("nan"),
                 focal_sigma=fit.focal_sigma if fit else float("nan"),
             )
-            evidence = replace(evidence, probability_wrong=probability_wrong(evidence))
+            evidence = replace(evidence, probability_wrong=probability_wrong(evidence, camera.K[0, 0]))
             return _Candidate(view, evidence, fit, verdict(evidence, options.limits))
 
 

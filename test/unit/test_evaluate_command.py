@@ -5,7 +5,7 @@ import itertools
 import json
 import re
 import shutil
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 
@@ -22,7 +22,7 @@ from gsfeatloc_ros.evaluate.degradations import DEGRADATIONS
 from gsfeatloc_ros.evaluate.negatives import NEGATIVES
 from gsfeatloc_ros.evaluate.plan import Combinations, Evaluation
 from gsfeatloc_ros.evaluate.record import _NOT_MEASURED, Record, fingerprint_of, hash_scene
-from gsfeatloc_ros.evaluate.run import Run, draw_priors
+from gsfeatloc_ros.evaluate.run import Run, draw_priors, trace
 from gsfeatloc_ros.evaluate.scene import load_scene
 from gsfeatloc_ros.evaluate.suites import SUITES
 from gsfeatloc_ros.evaluate.tables import Group
@@ -188,9 +188,11 @@ def test_the_suite_runs_everything(trust):
     folder, _ = trust
     report = read(folder / "trust.json")
     runs = report["runs"]
-    assert [run["corruption"] for run in runs if run["corruption"]] == list(CORRUPTIONS)
+    assert [run["corruption"] for run in runs if run["corruption"] and not run["negative"]] == list(CORRUPTIONS)
     assert [run["degradation"] for run in runs if run["degradation"]] == list(DEGRADATIONS)
-    assert [run["negative"] for run in runs if run["negative"]] == list(NEGATIVES)
+    assert [run["negative"] for run in runs if run["negative"] and not run["corruption"]] == list(NEGATIVES)
+    both = {(run["negative"], run["corruption"]) for run in runs if run["negative"] and run["corruption"]}
+    assert both > {("mirrored", "motion-25"), ("mirrored", "cover-40"), ("mirrored", "small-80")}
     assert [run["protocol"] for run in runs].count("near-miss") == 1
     assert all(run["queries"] == 1 for run in runs)
     total = report["trust"][-1]
@@ -235,6 +237,18 @@ def test_in_the_suite_the_photos_of_each_scene_are_looked_for_in_all_others():
     # A map is not degraded, or read, more often than needed.
     maps = [(run.scene, run.degradation) for run in runs]
     assert len(set(maps)) == sum(a != b for a, b in itertools.pairwise(maps)) + 1
+
+
+@pytest.mark.slow
+def test_negatives_are_corrupted_as_photos_are(room_scene):
+    plain = Run(room_scene, None, "paper", None, "default", "sift", 0.1, 0, 640, negative="mirrored")
+    mirrored, covered = (
+        trace(Evaluation([run], 1, Record(None)).to_do[0]).photo.image
+        for run in (plain, replace(plain, corruption="half-white"))
+    )
+    # The distortion is taken out after that, which moves the border a little.
+    np.testing.assert_array_equal(covered[:, :300], mirrored[:, :300])
+    assert (covered[:, 340:] == 255).all()
 
 
 @pytest.mark.slow

@@ -33,8 +33,9 @@ GOOD = Evidence(
     explained_inlier_ratio=0.99,
     coverage=0.8,
     correlation=0.95,
-    low_correlation=0.9,
+    scattered=0.03,
     changed=0.02,
+    beyond_map=0.01,
     reprojection_error_px=0.4,
     deviation=1.2,
     blur_px=0.0,
@@ -195,25 +196,61 @@ def test_numbers_and_texts_have_the_same_names() -> None:
 
 
 @given(
-    name=st.sampled_from(["explained_inlier_ratio", "correlation", "low_correlation"]),
-    low=st.floats(0.3, 0.98),
-    high=st.floats(0.3, 0.98),
+    name=st.sampled_from(["explained_inlier_ratio", "correlation", "scattered", "blur_px"]),
+    low=st.floats(0.01, 0.98),
+    high=st.floats(0.01, 0.98),
 )
 def test_more_agreement_never_makes_an_answer_less_probable(name: str, low: float, high: float) -> None:
     low, high = sorted((low, high))
-    assert probability_wrong(replace(GOOD, **{name: high})) <= probability_wrong(replace(GOOD, **{name: low}))
+    if name in ("scattered", "blur_px"):
+        low, high = high, low
+    alike, unlike = (probability_wrong(replace(GOOD, **{name: value}), 500.0) for value in (high, low))
+    assert alike <= unlike
 
 
 def test_probabilities_tell_what_was_seen_apart() -> None:
-    """As measured: a right answer, one in a photo that is covered by 60 %, lego's worst mirror image, a wrong pose."""
-    right = replace(GOOD, explained_inlier_ratio=0.99, correlation=0.943, low_correlation=0.89)
-    covered = replace(GOOD, explained_inlier_ratio=0.971, correlation=0.908, low_correlation=0.835)
-    mirrored = replace(GOOD, explained_inlier_ratio=0.968, correlation=0.808, low_correlation=0.703)
-    wrong = replace(GOOD, explained_inlier_ratio=0.77, correlation=0.5, low_correlation=0.3)
-    assert probability_wrong(right) < 1e-6
-    assert probability_wrong(covered) < 1e-4 < 0.01 < probability_wrong(mirrored) < probability_wrong(wrong)
-    assert probability_wrong(wrong) > 0.999
-    assert np.isnan(probability_wrong(Evidence()))
+    """As measured: a right answer, one in a photo that is covered by 60 %, lego's best mirror image, a wrong pose."""
+
+    def seen(agreeing: float, correlation: float, scattered: float, blur_px: float = 0.0) -> float:
+        evidence = Evidence(
+            explained_inlier_ratio=agreeing, correlation=correlation, scattered=scattered, blur_px=blur_px
+        )
+        return probability_wrong(evidence, 889.0)
+
+    right, covered = seen(0.994, 0.931, 0.008), seen(0.984, 0.891, 0.117)
+    mirrored, wrong = seen(0.971, 0.802, 0.094), seen(0.77, 0.5, 0.4)
+    assert right < 1e-12 < covered < 1e-4 < 0.01 < mirrored < wrong
+    assert wrong > 0.999
+    assert np.isnan(probability_wrong(Evidence(), 500.0))
+
+
+def test_where_detail_is_lost_photo_and_render_must_be_more_alike() -> None:
+    """As measured: the mirror image of a photo of lego that is moved by 25 pixels, and a photo of bonsai that is."""
+    alike = Evidence(explained_inlier_ratio=0.952, correlation=0.908, scattered=0.097, blur_px=0.0)
+    assert probability_wrong(alike, 889.0) < 1e-4
+    assert probability_wrong(replace(alike, blur_px=27.0), 889.0) > 0.1
+    # The same blur is a wider angle to a shorter lens.
+    assert probability_wrong(replace(alike, blur_px=13.5), 444.5) == probability_wrong(
+        replace(alike, blur_px=27.0), 889.0
+    )
+    moved = Evidence(explained_inlier_ratio=0.993, correlation=0.981, scattered=0.013, blur_px=27.0)
+    assert probability_wrong(moved, 661.0) < 1e-12
+
+
+def test_from_where_most_of_the_photo_is_beyond_the_map_its_mirror_image_decides() -> None:
+    """A wall seen from behind looks as its mirror image does."""
+    for deviation in (9.0, float("nan")):
+        seen = replace(GOOD, deviation=deviation, beyond_map=0.25)
+        assert verdict(seen, Limits()) == ()
+        behind = replace(seen, beyond_map=0.26)
+        assert is_uncertain(behind, Limits())
+        (reason,) = verdict(behind, Limits())
+        assert "(at most 0, for the map shows nothing of 26% of the photo" in reason
+        assert verdict(with_mirror(behind, 1.0), Limits()) == ()
+        (reason,) = verdict(with_mirror(behind, 1e-12), Limits())
+        assert "is the image flipped?" in reason
+    # Where the prior says so, the map may be a small part of the place.
+    assert verdict(replace(GOOD, beyond_map=0.9), Limits()) == ()
 
 
 def test_deviation_counts_standard_deviations_of_the_prior() -> None:
