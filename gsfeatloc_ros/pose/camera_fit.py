@@ -21,6 +21,9 @@ _CALIBRATED = np.array([0.002, 0.005, 0.0015, 0.0015, 0.0015])
 # any case: it can hardly be told from the distance, and a calibration is better than what one photo says.
 _EXACT = np.array([1e-5, 0.001, 0.0005, 0.0005, 0.0005])
 _FOCAL = 0
+# What a photo says of the camera is judged as if its matches were spread over a whole one: that is what the limits on
+# the focal length (localize/evidence.py) were set by.
+_WHOLE_PHOTO = 18.0
 # Steps are taken until what they change, in standard deviations, is less than a thousandth.
 _MAX_ITERATIONS = 6
 _MIN_STEP = 1e-3
@@ -98,7 +101,7 @@ def _fit(camera: Camera, calibrated: _State, found: Correspondences, options: Po
     problem = _Problem.seen_from(free, camera, found, options)
     system = problem.at(free)
     # A camera that is off leaves a smooth field as a bent map does: it must not excuse itself by that.
-    unbent = replace(problem.field(system), smooth=0.0)
+    unbent = replace(problem.field(system), smooth=0.0, patches=_WHOLE_PHOTO)
     sigmas = problem.camera_sigmas(system, unbent, _ANY_CAMERA)
     excess = np.sqrt(np.maximum(free.camera**2 - sigmas**2, 0.0))
     # What the photo does not contradict is as calibrated: it says more of the focal length then.

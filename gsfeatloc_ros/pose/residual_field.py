@@ -11,6 +11,9 @@ import numpy as np
 _NEIGHBOUR_DISTANCE, _FIELD_DISTANCE = 25.0, 60.0
 MIN_PIXEL_SIGMA = 0.1
 """Keypoints are no better than this, in pixels, however well a few of them happen to agree."""
+# Squares of this many pixels across: what map and camera are off by is taken to be the same all over one, and nothing
+# to the next. The errors of photos, of crops and of what is left of covered ones are as large as follows from that.
+_PATCH = 80.0
 # All pairs of at most so many matches are looked at.
 _MAX_PAIRED = 400
 # A smooth field of this variance, in square pixels, is found in good maps too. What is beyond it the pose has as well.
@@ -30,10 +33,13 @@ class ResidualField:
         smooth: what matches have in common that are no neighbours. They are alike where the map is bent, or the camera
             is not as it is taken to be, in a way that no pose explains.
         total: of all.
+        patches: how many patches of the photo the matches are spread over: as many as there would be if each had the
+            same number of them (the inverse participation ratio).
     """
 
     smooth: float
     total: float
+    patches: float
 
     @staticmethod
     def of(pixels: np.ndarray, residuals: np.ndarray, max_error: float) -> ResidualField:
@@ -45,10 +51,11 @@ class ResidualField:
 
         squared = (residuals**2).sum(axis=1)
         agrees = np.flatnonzero(squared <= max_error**2)
+        patches = _effective_patches(pixels[agrees])
         agrees = agrees[:: 1 + len(agrees) // _MAX_PAIRED]
         total = 0.5 * float(squared[agrees].mean()) if len(agrees) else 0.0
         smooth = mean_product(pixels[agrees], residuals[agrees], _NEIGHBOUR_DISTANCE, _FIELD_DISTANCE)
-        return ResidualField(smooth, total)
+        return ResidualField(smooth, total, patches)
 
     @property
     def bent_variance(self) -> float:
@@ -62,7 +69,17 @@ class ResidualField:
     def shared_variance(self, share: float) -> float:
         """Return the variance, in square pixels along an axis, of the error that all matches have in common.
 
-        It is a share of the variance of what each is off by, and what the smooth field says beyond.
+        It is the variance of what each is off by, of which matches of one patch share this share and those of others
+        nothing, and what the smooth field says beyond.
         """
         total = max(self.total, MIN_PIXEL_SIGMA**2)
-        return share * total + max(self.smooth - _USUAL_FIELD, 0.0) + self.bent_variance
+        return share * total / self.patches + max(self.smooth - _USUAL_FIELD, 0.0) + self.bent_variance
+
+
+def _effective_patches(pixels: np.ndarray) -> float:
+    """Return the number of patches that pixels (M, 2) are spread over; 1 for none."""
+    if len(pixels) == 0:
+        return 1.0
+    columns, rows = np.floor(pixels.T / _PATCH).astype(int)
+    counts = np.bincount((rows - rows.min()) * (np.ptp(columns) + 1) + columns - columns.min())
+    return float(len(pixels) ** 2 / (counts.astype(float) ** 2).sum())

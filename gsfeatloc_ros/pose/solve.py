@@ -37,15 +37,15 @@ class PoseOptions:
     Attributes:
         cauchy_scale: of the robust loss, in standard deviations. Real residuals have longer tails than a Gaussian's, so
             it is narrow.
-        shared_share: share of the residuals' variance that all matches have in common (errors of the map, of its poses,
-            of the calibration) and that does not average out over them. Fitted on real photos: docs/trust.md.
+        shared_share: share of the residuals' variance that the matches of a patch of the photo have in common (errors
+            of the map, of its poses, of the calibration) and that does not average out over them: docs/trust.md.
     """
 
     max_reprojection_error: float = parameter(
         3.0, "Pixels of the resized image within which a corner agrees with a pose.", (0.1, 50.0), live=True
     )
     cauchy_scale: float = 1.0
-    shared_share: float = 0.055
+    shared_share: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,7 +22,7 @@ def bend(at: np.ndarray, amplitude: float) -> np.ndarray:
 @pytest.mark.parametrize("count", [0, 1, 2])
 def test_few_residuals_have_no_field(count: int) -> None:
     field = ResidualField.of(np.zeros((count, 2)), np.zeros((count, 2)), 3.0)
-    assert field == ResidualField(0.0, 0.0)
+    assert field == ResidualField(0.0, 0.0, 1.0)
     assert field.bent_variance == 0
 
 
@@ -74,14 +74,41 @@ def test_wrong_matches_are_no_bend() -> None:
     assert ResidualField.of(at, residuals, 3.0).bent_variance == 0
 
 
-@given(st.floats(0.0, 2.0))
-def test_what_all_share_is_a_share_of_the_variance_of_each(sigma: float) -> None:
+@given(st.floats(0.0, 2.0), st.floats(1.0, 50.0))
+def test_what_all_share_is_the_variance_of_each_over_the_patches(sigma: float, patches: float) -> None:
     """But keypoints are never better than a tenth of a pixel, however well they agree."""
-    assert ResidualField(0.0, sigma**2).shared_variance(0.05) == pytest.approx(0.05 * max(sigma, 0.1) ** 2)
+    field = ResidualField(0.0, sigma**2, patches)
+    assert field.shared_variance(0.5) == pytest.approx(0.5 * max(sigma, 0.1) ** 2 / patches)
 
 
 def test_a_smooth_field_is_shared_beyond_that_of_good_maps() -> None:
-    assert ResidualField(0.01, 1.0).shared_variance(0.05) == pytest.approx(0.05)
-    assert ResidualField(0.04, 1.0).shared_variance(0.05) == pytest.approx(0.05 + 0.03)
-    bent = ResidualField(0.2, 0.3)
-    assert bent.shared_variance(0.05) == pytest.approx(0.05 * 0.3 + 0.19 + bent.bent_variance)
+    assert ResidualField(0.01, 1.0, 20.0).shared_variance(1.0) == pytest.approx(0.05)
+    assert ResidualField(0.04, 1.0, 20.0).shared_variance(1.0) == pytest.approx(0.05 + 0.03)
+    bent = ResidualField(0.2, 0.3, 20.0)
+    assert bent.shared_variance(1.0) == pytest.approx(0.05 * 0.3 + 0.19 + bent.bent_variance)
+
+
+def test_patches_are_counted_as_if_each_had_as_many_matches() -> None:
+    whole = np.stack(np.meshgrid(np.arange(10, 640, 20.0), np.arange(10, 480, 20.0)), axis=-1).reshape(-1, 2)
+
+    def patches(at: np.ndarray) -> float:
+        return ResidualField.of(at, np.zeros(at.shape), 3.0).patches
+
+    assert patches(whole) == pytest.approx(48)
+    assert patches(whole[whole[:, 0] < 320]) == pytest.approx(24)
+    # Where they are does not matter, nor what does not agree.
+    assert patches(whole[whole[:, 0] < 320] + [800.0, -160.0]) == pytest.approx(24)
+    residuals = np.zeros(whole.shape)
+    residuals[whole[:, 0] >= 320] = 5.0
+    assert ResidualField.of(whole, residuals, 3.0).patches == pytest.approx(24)
+    # Three patches of which one has as many as the others together: 16 / (4 + 1 + 1).
+    one_and_two = np.concatenate([np.full((20, 2), 10.0), np.full((10, 2), 100.0), np.full((10, 2), 200.0)])
+    assert patches(one_and_two) == pytest.approx(16 / 6)
+
+
+@given(st.integers(1, 300), st.integers(0, 2**32 - 1))
+def test_there_are_no_more_patches_than_matches_or_cells(count: int, seed: int) -> None:
+    at = pixels(seed, count)
+    cells = len({(int(x // 80), int(y // 80)) for x, y in at})
+    field = ResidualField.of(at, np.zeros(at.shape), 3.0)
+    assert 1 <= field.patches <= min(count, cells) + 1e-9
