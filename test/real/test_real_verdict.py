@@ -69,3 +69,18 @@ def test_a_render_beside_the_photo_does_not_speak_for_another_focal_length(scene
     estimate = localizer.localize(image, camera, prior.T_map_camera, prior.covariance)
     assert estimate.localized, estimate.reason
     assert rotation_error_deg(estimate.T_map_camera, photo.T_map_camera) < 0.2
+
+
+@pytest.mark.parametrize("corruption", ["motion", "motion-25"])
+@pytest.mark.parametrize("mirrored", [True, False])
+def test_a_blurred_mirror_image_is_no_photo(scenes, corruption: str, mirrored: bool) -> None:
+    """The photo was taken from lego's plane of symmetry: all that tells its mirror image apart is detail."""
+    scene = load_scene(scenes / "lego")
+    photo = next(photo for photo in scene.photos if photo.name == "test_r_0.png")
+    image = scene.read_photo(photo)
+    image, camera = corrupt(corruption, np.fliplr(image) if mirrored else image, photo.camera, (300, 0))
+    localizer = Localizer(load_scene_renderer(scene, RendererSettings()), create_matcher("sift"))
+    estimate = localizer.localize(image, camera, photo.T_map_camera)
+    assert estimate.localized is not mirrored
+    if mirrored:
+        assert "it is wrong with a probability of" in estimate.reason
