@@ -42,7 +42,7 @@ test: lint build
 
 # The option named last counts: the one of pyproject.toml comes before it.
 nightly: build
-	@. scripts/env.sh && python -P -m pytest -m nightly $(ARGS)
+	@. scripts/env.sh && $(CLEAN_UP) && python -P -m pytest -m nightly $(ARGS)
 
 # These run the sources here. Name a test or an option of pytest by ARGS: make unit ARGS="-k camera -x"
 unit: setup
@@ -61,7 +61,7 @@ gsplat: build
 
 fuzz: build
 	@. scripts/env.sh && python -P scripts/fuzz.py $(ARGS)
-	@. scripts/env.sh && python -P scripts/fuzz_node.py
+	@. scripts/env.sh && $(CLEAN_UP) && python -P scripts/fuzz_node.py
 
 lint: setup
 	@. scripts/env.sh && ruff check . && ruff format --check . && mypy

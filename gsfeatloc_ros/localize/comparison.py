@@ -9,7 +9,7 @@ from functools import lru_cache, partial
 import cv2
 import numpy as np
 
-from gsfeatloc_ros.common.arrays import to_host
+from gsfeatloc_ros.common.arrays import Array, to_host
 from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.doubt import fisher_z
 from gsfeatloc_ros.common.local_structure import local_structure
@@ -29,9 +29,9 @@ _NEIGHBOURHOOD = 12.0
 _MIN_CONTRAST = 2.0
 # Pixels that are compared must be covered by the map, and seen by the lens.
 _MIN_ALPHA = 0.9
+_MIN_COVERED = 0.5
 # Where it has less, the map shows nothing.
 _MIN_ALPHA_OF_MAP = 0.5
-_MIN_COVERED = 0.5
 # A cell is compared where so much of it is covered, and so much of that has contrast in one of the pictures.
 _MIN_COVERED_SHARE = 0.3
 _MIN_CONTRAST_SHARE = 0.5
@@ -134,7 +134,7 @@ def compare(
         disagreeing=_count(pixels[~all_agree], camera),
         correlation=correlation,
         correlation_beside_changes=beside_changes,
-        beyond_map=_share_beyond(query.tracker.corners, to_host(view.render.alpha)),
+        beyond_map=_share_beyond(query.tracker.corners, view.render.alpha),
     )
 
 
@@ -170,10 +170,11 @@ def changed_mask(photo: Photo, view: MatchedView) -> np.ndarray:
     return cv2.resize(changed, (photo.camera.width, photo.camera.height), interpolation=cv2.INTER_NEAREST)
 
 
-def _share_beyond(corners: np.ndarray, alpha: np.ndarray) -> float:
+def _share_beyond(corners: np.ndarray, alpha: Array) -> float:
     """Return the share of corners (N, 2) that lie where a map's alpha (H, W) is small; NaN without any."""
     columns, rows = np.rint(corners).astype(int).T
-    return float((alpha[rows, columns] < _MIN_ALPHA_OF_MAP).mean()) if len(corners) else float("nan")
+    # Of a picture on a GPU only these pixels are fetched.
+    return float((to_host(alpha[rows, columns]) < _MIN_ALPHA_OF_MAP).mean()) if len(corners) else float("nan")
 
 
 def _count(pixels: np.ndarray, camera: Camera) -> np.ndarray:

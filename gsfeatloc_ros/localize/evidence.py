@@ -247,11 +247,12 @@ def _is_no_mirror_image(evidence: Evidence) -> bool:
 
 def _why_so_little_risk(evidence: Evidence, limits: Limits) -> str:
     """Return in words why less risk is taken with a pose; nothing for one with which all is."""
-    if _share_of_risk(evidence, limits) == 1.0:
+    share = _share_of_risk(evidence, limits)
+    if share == 1.0:
         return ""
     if evidence.mirror_probability_wrong < 1 and not _is_no_mirror_image(evidence):
         return ", for the photo's mirror image fits about as well: is the image flipped?"
-    if not evidence.beyond_map <= _MAX_BEYOND_MAP:
+    if share == 0.0:
         nothing = f", for the map shows nothing of {evidence.beyond_map:.0%} of the photo"
         return nothing + _why_unexpected(evidence, limits)
     return _why_unexpected(evidence, limits)

@@ -132,10 +132,10 @@ def test_what_disagrees_among_what_agrees_is_told_apart() -> None:
     agreeing, disagreeing, correlation = np.full((12, 16), 8), np.full((12, 16), 2), np.full((12, 16), 0.9)
     scattered = Comparison(0.8, 0.8, agreeing, disagreeing, correlation, correlation, 0.0)
     assert scattered.explained_inlier_ratio == pytest.approx(0.8, abs=1e-3)
-    # The same numbers, all of what disagrees in one part.
     assert scattered.scattered == pytest.approx(0.5 / 193)
     disagreeing[3, 5], correlation[4, 6:9] = 9, 0.4
     assert scattered.scattered == pytest.approx(4.5 / 193)
+    # The same numbers, all of what disagrees in one part.
     agreeing[:, 13:], disagreeing[:, :13], correlation[:, 13:] = 0, 0, 0.1
     assert Comparison(0.8, 0.8, agreeing, disagreeing, correlation, correlation, 0.0).explained_inlier_ratio > 0.999
     assert np.isnan(

@@ -247,6 +247,10 @@ def test_from_where_most_of_the_photo_is_beyond_the_map_its_mirror_image_decides
         (reason,) = verdict(behind, Limits())
         assert "(at most 0, for the map shows nothing of 26% of the photo" in reason
         assert verdict(with_mirror(behind, 1.0), Limits()) == ()
+        # It was seen to be no mirror image, but not that it is right: the map's edge is not the reason.
+        (reason,) = verdict(with_mirror(replace(behind, probability_wrong=1.01e-4), 1.0), Limits())
+        assert "(at most 1e-06" in reason
+        assert "shows nothing" not in reason
         (reason,) = verdict(with_mirror(behind, 1e-12), Limits())
         assert "is the image flipped?" in reason
     # Where the prior says so, the map may be a small part of the place.
