@@ -22,7 +22,7 @@ from gsfeatloc_ros.match.base import Worth, all_of_them
 from gsfeatloc_ros.pose.lift import LiftOptions
 from gsfeatloc_ros.render.base import Render, Renderer
 
-ABLATIONS = ("tracking", "sub-pixel", "median-depth", "depth-gating", "robust-loss")
+ABLATIONS = ("tracking", "sub-pixel", "median-depth", "depth-gating", "parallax", "robust-loss")
 
 # Lifts every pixel that has a depth.
 _NO_DEPTH_GATING = LiftOptions(min_alpha=0.0, max_depth_step=float("inf"))
@@ -46,6 +46,8 @@ def ablated_localizer(components: Components, ablation: str = "") -> Localizer:
         renderer = MeanDepthRenderer(renderer)
     elif ablation == "depth-gating":
         options = replace(options, lift=_NO_DEPTH_GATING)
+    elif ablation == "parallax":
+        options = replace(options, lift=replace(options.lift, max_scatter=float("inf")))
     elif ablation == "robust-loss":
         options = replace(options, pose=replace(options.pose, cauchy_scale=_NO_ROBUST_LOSS_SCALE))
     elif ablation:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -115,10 +115,10 @@ def compare(
 
     Corners agree with it that are off by at most `tolerance` pixels; `errors` says by how many each of (M,) is.
     """
-    camera, lifted = query.photo.camera, partial(query.lifted, view.pose, view.render)
+    camera = query.photo.camera
     with query.clock.stage("track"):
-        back = query.tracker.track_back(view.image, lambda pixels: lifted(pixels).valid)
-        found = query.correspondences(back.a, lifted(back.b), view.pose)
+        back = query.tracker.track_back(view.image, lambda pixels: view.lift(pixels).valid)
+        found = query.correspondences(back.a, view.lift(back.b), view.pose)
     with query.clock.stage("verify"):
         pair = _Pair.of(query.photo, view)
         structures = pair.structures(pair.covered)

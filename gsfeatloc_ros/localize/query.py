@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sized
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import cv2
 import numpy as np
 
 from gsfeatloc_ros.common.arrays import Array, to_host
 from gsfeatloc_ros.common.camera import Camera
-from gsfeatloc_ros.common.geometry import invert, transform
+from gsfeatloc_ros.common.geometry import invert, make_pose, transform
 from gsfeatloc_ros.common.photo import Photo
 from gsfeatloc_ros.common.stage_clock import StageClock
 from gsfeatloc_ros.index import Nearest, ViewIndex
@@ -19,6 +19,7 @@ from gsfeatloc_ros.localize.blur import Blur
 from gsfeatloc_ros.localize.options import LocalizerOptions
 from gsfeatloc_ros.match.base import Features, Matcher, Matches, Tracker
 from gsfeatloc_ros.pose.lift import Lifted, lift
+from gsfeatloc_ros.pose.parallax import lift_as_nearest, lift_by_parallax, step_aside
 from gsfeatloc_ros.pose.readout import at_middle_row
 from gsfeatloc_ros.pose.solve import Correspondences, PoseSolution, solve_near, solve_pose
 from gsfeatloc_ros.render.base import Render, Renderer
@@ -39,6 +40,7 @@ class MatchedView:
         lifted_matches: those whose render pixel has a depth.
         found: these with the points of the map.
         solution: the photo's pose from them, None where they agree on none.
+        lift: finds the points of the map under other pixels (N, 2) of the render.
     """
 
     pose: np.ndarray
@@ -48,6 +50,7 @@ class MatchedView:
     lifted_matches: Matches
     found: Correspondences
     solution: PoseSolution | None
+    lift: Callable[[np.ndarray], Lifted]
 
     @property
     def inliers(self) -> int:
@@ -159,23 +162,40 @@ class Query:
             features = matcher.features(image)
         with self.clock.stage("match"):
             matches = matcher.match(photo_features, features, same_way_up)
-        view = self._solve(pose, render, image, matches)
+        view = self._solve(pose, render, image, matches, self._lifted(pose, render, matches.b))
         self._last_render.matched[same_way_up] = view
         return view
 
     def track(self, pose: np.ndarray, blur: Blur | None = None) -> MatchedView:
         """Do the same where the pose is nearly the photo's: track the photo's corners to the render instead.
 
-        Corners where the render has no depth to trust are left out. It is blurred by `blur`, as the photo is; None for
-        a sharp one.
+        Corners where the render has no depth to trust are left out; where it has hardly any, how far away they are is
+        seen by parallax. It is blurred by `blur`, as the photo is; None for a sharp one.
         """
-        tracker, render = self.tracker, self.render(pose)
+        tracker, render, options = self.tracker, self.render(pose), self.components.options.lift
+        step = step_aside(render, self.photo.camera, tracker.corners, options.max_scatter)
+        if step > 0:
+            return self._track_by_parallax(pose, step, blur)
         with self.clock.stage("track"):
-            image = render.device_image()
-            if blur is not None:
-                image = cv2.filter2D(to_host(image), -1, blur.kernel)
-            matches = tracker.track(image, lambda pixels: self.lifted(pose, render, pixels).valid)
-        return self._solve(pose, render, image, matches)
+            image = _blurred(render, blur)
+            matches = tracker.track(image, lambda pixels: self._lifted(pose, render, pixels).valid)
+        return self._solve(pose, render, image, matches, self._lifted(pose, render, matches.b))
+
+    def _track_by_parallax(self, pose: np.ndarray, step: float, blur: Blur | None) -> MatchedView:
+        """Track to the render at a pose (4, 4), and to one a `step` to its right, which tells how far corners are."""
+        tracker, render, camera = self.tracker, self.render(pose), self.photo.camera
+        with self.clock.stage("render"):
+            aside = self.components.renderer.render(camera, pose @ make_pose(np.eye(3), np.array([step, 0.0, 0.0])))
+        with self.clock.stage("track"):
+            # The tracker keeps what it saw last, which will be asked for again.
+            found_aside, image = tracker.track(_blurred(aside, blur)), _blurred(render, blur)
+            found = tracker.track(image)
+            # As complex numbers corners can be sorted.
+            _, here, there = np.intersect1d(found.a @ [1, 1j], found_aside.a @ [1, 1j], return_indices=True)
+            matches = found.select(here)
+        lifted = lift_by_parallax(camera, pose, matches.b, found_aside.b[there], step)
+        view = self._solve(pose, render, image, matches, lifted)
+        return replace(view, lift=lambda pixels: lift_as_nearest(camera, pose, pixels, matches.b, lifted))
 
     def track_from_afar(self, pose: np.ndarray) -> MatchedView:
         """Do the same where the pose may be some way off: with fewer corners, which need not be where depth is."""
@@ -183,9 +203,9 @@ class Query:
         with self.clock.stage("track"):
             image = render.device_image()
             matches = tracker.track(image, _some)
-        return self._solve(pose, render, image, matches)
+        return self._solve(pose, render, image, matches, self._lifted(pose, render, matches.b))
 
-    def lifted(self, pose: np.ndarray, render: Render, pixels: np.ndarray) -> Lifted:
+    def _lifted(self, pose: np.ndarray, render: Render, pixels: np.ndarray) -> Lifted:
         """Return the points of the map under pixels (M, 2) of a render at a pose (4, 4)."""
         return lift(render, self.photo.camera, pose, pixels, self.components.options.lift)
 
@@ -211,16 +231,22 @@ class Query:
     def _last_render(self) -> _LastRender:
         return _LastRender()
 
-    def _solve(self, pose: np.ndarray, render: Render, image: Array, matches: Matches) -> MatchedView:
+    def _solve(self, pose: np.ndarray, render: Render, image: Array, matches: Matches, lifted: Lifted) -> MatchedView:
         options, camera = self.components.options, self.photo.camera
         with self.clock.stage("solve"):
-            lifted = self.lifted(pose, render, matches.b)
             lifted_matches = matches.select(lifted.valid)
             found = self.correspondences(matches.a, lifted, pose)
             solution = solve_near(camera, pose, found, options.pose)
             if solution is None or not self.plausible(solution.T_map_camera):
                 solution = solve_pose(camera, found, options.pose, options.seed, self.plausible)
-        return MatchedView(pose, render, image, len(matches), lifted_matches, found, solution)
+        lift = partial(self._lifted, pose, render)
+        return MatchedView(pose, render, image, len(matches), lifted_matches, found, solution, lift)
+
+
+def _blurred(render: Render, blur: Blur | None) -> Array:
+    """Return the picture (H, W, 3) of a render, with this blur."""
+    image = render.device_image()
+    return image if blur is None else cv2.filter2D(to_host(image), -1, blur.kernel)
 
 
 def _some(pixels: np.ndarray) -> np.ndarray:

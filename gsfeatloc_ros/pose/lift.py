@@ -27,11 +27,14 @@ class LiftOptions:
         max_depth_spread: largest spread of the depths that made the pixel, relative to the median. Of two layers, the
             spread is at most half of the farther one's depth: where it is more than half of the median, the median is
             that of a haze in front of what is seen.
+        max_scatter: largest median of these spreads, over the corners of a photo. Beyond it no depth is trusted, and
+            how far away corners are is seen by parallax (pose/parallax.py).
     """
 
     min_alpha: float = 0.8
     max_depth_step: float = 0.1
     max_depth_spread: float = 0.5
+    max_scatter: float = 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,23 +65,29 @@ def lift(render: Render, camera: Camera, T_map_camera: np.ndarray, pixels: np.nd
     pixels = np.ascontiguousarray(pixels, np.float64)
     places, weights = bilinear_neighbours(pixels, width, height)
     limits = options.min_alpha, options.max_depth_step, options.max_depth_spread
-    depth, depth_std = surface_depths(*_on_host(render, places), weights, *limits)
+    depth, depth_std = surface_depths(*on_host(render, places), weights, *limits)
     depth_std = np.minimum(depth_std, MAX_DEPTH_STD * depth)
+    return lift_to(camera, T_map_camera, pixels, depth, DEPTH_SIGMA_PER_STD * depth_std)
+
+
+def lift_to(
+    camera: Camera, T_map_camera: np.ndarray, pixels: np.ndarray, depths: np.ndarray, sigmas: np.ndarray
+) -> Lifted:
+    """Lift pixels (M, 2) to z-depths (M,) with these standard deviations (M,); NaN: not valid."""
     rays = camera.rays(pixels)
-    points = transform(T_map_camera, rays * depth[:, None])
-    sigmas = (rays * (DEPTH_SIGMA_PER_STD * depth_std)[:, None]) @ T_map_camera[:3, :3].T
-    return Lifted(points, sigmas, np.isfinite(depth))
+    points = transform(T_map_camera, rays * depths[:, None])
+    return Lifted(points, (rays * sigmas[:, None]) @ T_map_camera[:3, :3].T, np.isfinite(depths))
 
 
-def _on_host(render: Render, places: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Median depth, its spread and alpha, flat, with places (M, 4) in them where they are as at these in the render."""
+def on_host(render: Render, places: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Median depth, its spread and alpha, flat, and where in them is what is at places (M, ...) of the render."""
     pictures = (render.median_depth, render.depth_std, render.alpha)
     if isinstance(render.alpha, np.ndarray):
         median_depth, depth_std, alpha = (to_host(picture).ravel() for picture in pictures)
         return median_depth, depth_std, alpha, places
     import torch
 
-    # All of the render that comes to the host, in one copy each way.
+    # All that is wanted of the render, in one copy each way.
     there = to_device(places.ravel(), render.alpha.device)
     median_depth, depth_std, alpha = torch.stack([picture.flatten()[there] for picture in pictures]).cpu().numpy()
     return median_depth, depth_std, alpha, np.arange(places.size).reshape(places.shape)
