@@ -95,10 +95,12 @@ class Components:
 
 @dataclass
 class _LastRender:
-    """What was rendered last, and from which pose (4, 4); and what features say of it, by `same_way_up`, if asked."""
+    """What was rendered last, and from which pose (4, 4); from a step aside and what features say of it, if asked."""
 
     pose: np.ndarray = field(default_factory=lambda: np.eye(4))
     render: Render | None = None
+    aside: Render | None = None
+    # By `same_way_up`.
     matched: dict[bool, MatchedView] = field(default_factory=dict)
 
 
@@ -184,8 +186,7 @@ class Query:
     def _track_by_parallax(self, pose: np.ndarray, step: float, blur: Blur | None) -> MatchedView:
         """Track to the render at a pose (4, 4), and to one a `step` to its right, which tells how far corners are."""
         tracker, render, camera = self.tracker, self.render(pose), self.photo.camera
-        with self.clock.stage("render"):
-            aside = self.components.renderer.render(camera, pose @ make_pose(np.eye(3), np.array([step, 0.0, 0.0])))
+        aside = self._render_aside(pose, step)
         with self.clock.stage("track"):
             # The tracker keeps what it saw last, which will be asked for again.
             found_aside, image = tracker.track(_blurred(aside, blur)), _blurred(render, blur)
@@ -224,8 +225,17 @@ class Query:
         if last.render is None or not np.array_equal(last.pose, pose):
             with self.clock.stage("render"):
                 last.render = self.components.renderer.render(self.photo.camera, pose)
-            last.pose, last.matched = pose.copy(), {}
+            last.pose, last.aside, last.matched = pose.copy(), None, {}
         return last.render
+
+    def _render_aside(self, pose: np.ndarray, step: float) -> Render:
+        """Render the map a `step` to the right of the pose (4, 4) that was rendered last, unless that was done."""
+        last = self._last_render
+        if last.aside is None:
+            with self.clock.stage("render"):
+                aside = pose @ make_pose(np.eye(3), np.array([step, 0.0, 0.0]))
+                last.aside = self.components.renderer.render(self.photo.camera, aside)
+        return last.aside
 
     @cached_property
     def _last_render(self) -> _LastRender:
