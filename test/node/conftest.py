@@ -15,8 +15,8 @@ _FILES = itertools.count()
 def ros_domain() -> Iterator[None]:
     """A ROS domain for each file, apart from those of the other worker.
 
-    Shared memory of Fast DDS is named by the domain: what a node that was killed leaves broken there, CI has seen it
-    swallow all messages to later nodes, stays where it happened.
+    Shared memory of Fast DDS is named by the domain: a port of it that a node left broken, so that later ones hear
+    nothing (github.com/eProsima/Fast-DDS/issues/5053; CI has seen it once), stays where it happened.
     """
     worker = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
     with pytest.MonkeyPatch.context() as environment:
