@@ -36,10 +36,10 @@ def test_a_wheel_that_agrees_does_not_hide_the_rest(scenes) -> None:
 @pytest.mark.parametrize(
     ("scene_name", "photo_name", "corruption", "seed", "says"),
     [
-        ("bonsai", "DSCF5813.jpg", "focal-10", 103, "the focal length fits 12.0 +- 2.0 % longer than calibrated"),
         ("office", "00175.jpg", "focal+10", 305, "the focal length fits 8.0 +- 2.0 % shorter than calibrated"),
         ("office", "00175.jpg", "focal+10", 314, "the focal length fits 8.0 +- 2.0 % shorter than calibrated"),
-        # Once the same; by other matches of the search the reading itself says so.
+        # Once the same; by other matches of the search, or depths by parallax, the reading itself says so.
+        ("bonsai", "DSCF5813.jpg", "focal-10", 103, "% longer than calibrated: is camera_info of this stream?"),
         ("office", "00175.jpg", "focal+10", 102, "% shorter than calibrated: is camera_info of this stream?"),
         ("office", "00175.jpg", "focal+10", 200, "% shorter than calibrated: is camera_info of this stream?"),
     ],

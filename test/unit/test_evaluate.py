@@ -595,7 +595,8 @@ def test_success_by_step():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("ablation", ABLATIONS)
+# That of parallax makes one where there is haze: test_parallax.py.
+@pytest.mark.parametrize("ablation", sorted(set(ABLATIONS) - {"parallax"}))
 def test_every_ablation_makes_a_difference(ablation, room_map, room_camera, room_photos):
     photo, matcher = room_photos[0], create_matcher("sift")
     renderer = create_renderer(room_map)

@@ -119,7 +119,7 @@ def test_options_of_the_localizer_are_parameters_but_for_those_of_experts():
     groups = {"pose", "limits", "lift", "search"}
     names = {item.name for settings in (options, *nested) for item in fields(settings)} - groups
     parameters = {name.removeprefix("localizer.") for name in DEFAULTS if name.startswith("localizer.")}
-    experts = {"cauchy_scale", "shared_share", "min_alpha", "max_depth_step", "max_depth_spread"}
+    experts = {"cauchy_scale", "shared_share", "min_alpha", "max_depth_step", "max_depth_spread", "max_scatter"}
     assert names - parameters == experts
     assert parameters <= names
     # What the node sets from image to image.
