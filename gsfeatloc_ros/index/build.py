@@ -15,7 +15,8 @@ from gsfeatloc_ros.index.options import IndexOptions
 from gsfeatloc_ros.index.placement import NEAR, SMALL_VIEW, VIEW, cover, overlap, radius, random_poses, seen_cells, sees
 from gsfeatloc_ros.index.view_index import ViewIndex
 from gsfeatloc_ros.match.base import Features, Matcher
-from gsfeatloc_ros.pose.lift import LiftOptions, lift
+from gsfeatloc_ros.pose.lift import LiftOptions
+from gsfeatloc_ros.pose.parallax import lifting
 from gsfeatloc_ros.render.base import Renderer
 
 # Poses that are looked at small for each view that is wanted, and how many of them are looked at closely.
@@ -105,6 +106,7 @@ def _look(renderer: Renderer, matcher: Matcher, pose: np.ndarray) -> View:
     if not isinstance(features, Features):
         raise ValueError("the matcher has no descriptors by which views could be found: use sift, xfeat or another")
     strongest = np.argsort(-to_host(features.scores))[:_MAX_FEATURES]
-    lifted = lift(render, VIEW, pose, to_host(features.keypoints)[strongest].astype(np.float64), LiftOptions())
+    lift = lifting(renderer, render, VIEW, pose, LiftOptions())
+    lifted = lift(to_host(features.keypoints)[strongest].astype(np.float64))
     descriptors = to_host(features.descriptors)[strongest][lifted.valid]
     return View(pose, descriptors.astype(np.float32), lifted.points[lifted.valid])

@@ -4,22 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sized
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property
 
 import cv2
 import numpy as np
 
 from gsfeatloc_ros.common.arrays import Array, to_host
 from gsfeatloc_ros.common.camera import Camera
-from gsfeatloc_ros.common.geometry import invert, make_pose, transform
+from gsfeatloc_ros.common.geometry import invert, transform
 from gsfeatloc_ros.common.photo import Photo
 from gsfeatloc_ros.common.stage_clock import StageClock
 from gsfeatloc_ros.index import Nearest, ViewIndex
 from gsfeatloc_ros.localize.blur import Blur
 from gsfeatloc_ros.localize.options import LocalizerOptions
 from gsfeatloc_ros.match.base import Features, Matcher, Matches, Tracker
-from gsfeatloc_ros.pose.lift import Lifted, lift
-from gsfeatloc_ros.pose.parallax import lift_as_nearest, lift_by_parallax, step_aside
+from gsfeatloc_ros.pose.lift import Lift, Lifted
+from gsfeatloc_ros.pose.parallax import lifting
 from gsfeatloc_ros.pose.readout import at_middle_row
 from gsfeatloc_ros.pose.solve import Correspondences, PoseSolution, solve_near, solve_pose
 from gsfeatloc_ros.render.base import Render, Renderer
@@ -50,7 +50,7 @@ class MatchedView:
     lifted_matches: Matches
     found: Correspondences
     solution: PoseSolution | None
-    lift: Callable[[np.ndarray], Lifted]
+    lift: Lift
 
     @property
     def inliers(self) -> int:
@@ -95,11 +95,11 @@ class Components:
 
 @dataclass
 class _LastRender:
-    """What was rendered last, and from which pose (4, 4); from a step aside and what features say of it, if asked."""
+    """What was rendered last, and from which pose (4, 4); what lifts its pixels and what features say, if asked."""
 
     pose: np.ndarray = field(default_factory=lambda: np.eye(4))
     render: Render | None = None
-    aside: Render | None = None
+    lift: Lift | None = None
     # By `same_way_up`.
     matched: dict[bool, MatchedView] = field(default_factory=dict)
 
@@ -164,39 +164,21 @@ class Query:
             features = matcher.features(image)
         with self.clock.stage("match"):
             matches = matcher.match(photo_features, features, same_way_up)
-        view = self._solve(pose, render, image, matches, self._lifted(pose, render, matches.b))
+        view = self._solve(pose, render, image, matches)
         self._last_render.matched[same_way_up] = view
         return view
 
     def track(self, pose: np.ndarray, blur: Blur | None = None) -> MatchedView:
         """Do the same where the pose is nearly the photo's: track the photo's corners to the render instead.
 
-        Corners where the render has no depth to trust are left out; where it has hardly any, how far away they are is
-        seen by parallax. It is blurred by `blur`, as the photo is; None for a sharp one.
+        Corners that cannot be lifted are left out. The render is blurred by `blur`, as the photo is; None for a sharp
+        one.
         """
-        tracker, render, options = self.tracker, self.render(pose), self.components.options.lift
-        step = step_aside(render, self.photo.camera, tracker.corners, options.max_scatter)
-        if step > 0:
-            return self._track_by_parallax(pose, step, blur)
+        tracker, render, lift = self.tracker, self.render(pose), self._lift(pose)
         with self.clock.stage("track"):
             image = _blurred(render, blur)
-            matches = tracker.track(image, lambda pixels: self._lifted(pose, render, pixels).valid)
-        return self._solve(pose, render, image, matches, self._lifted(pose, render, matches.b))
-
-    def _track_by_parallax(self, pose: np.ndarray, step: float, blur: Blur | None) -> MatchedView:
-        """Track to the render at a pose (4, 4), and to one a `step` to its right, which tells how far corners are."""
-        tracker, render, camera = self.tracker, self.render(pose), self.photo.camera
-        aside = self._render_aside(pose, step)
-        with self.clock.stage("track"):
-            # The tracker keeps what it saw last, which will be asked for again.
-            found_aside, image = tracker.track(_blurred(aside, blur)), _blurred(render, blur)
-            found = tracker.track(image)
-            # As complex numbers corners can be sorted.
-            _, here, there = np.intersect1d(found.a @ [1, 1j], found_aside.a @ [1, 1j], return_indices=True)
-            matches = found.select(here)
-        lifted = lift_by_parallax(camera, pose, matches.b, found_aside.b[there], step)
-        view = self._solve(pose, render, image, matches, lifted)
-        return replace(view, lift=lambda pixels: lift_as_nearest(camera, pose, pixels, matches.b, lifted))
+            matches = tracker.track(image, lambda pixels: lift(pixels).valid)
+        return self._solve(pose, render, image, matches)
 
     def track_from_afar(self, pose: np.ndarray) -> MatchedView:
         """Do the same where the pose may be some way off: with fewer corners, which need not be where depth is."""
@@ -204,11 +186,7 @@ class Query:
         with self.clock.stage("track"):
             image = render.device_image()
             matches = tracker.track(image, _some)
-        return self._solve(pose, render, image, matches, self._lifted(pose, render, matches.b))
-
-    def _lifted(self, pose: np.ndarray, render: Render, pixels: np.ndarray) -> Lifted:
-        """Return the points of the map under pixels (M, 2) of a render at a pose (4, 4)."""
-        return lift(render, self.photo.camera, pose, pixels, self.components.options.lift)
+        return self._solve(pose, render, image, matches)
 
     def correspondences(self, pixels: np.ndarray, lifted: Lifted, pose: np.ndarray) -> Correspondences:
         """Return pixels (M, 2) of the photo with the points of the map there, where these could be lifted.
@@ -225,31 +203,30 @@ class Query:
         if last.render is None or not np.array_equal(last.pose, pose):
             with self.clock.stage("render"):
                 last.render = self.components.renderer.render(self.photo.camera, pose)
-            last.pose, last.aside, last.matched = pose.copy(), None, {}
+            last.pose, last.lift, last.matched = pose.copy(), None, {}
         return last.render
 
-    def _render_aside(self, pose: np.ndarray, step: float) -> Render:
-        """Render the map a `step` to the right of the pose (4, 4) that was rendered last, unless that was done."""
-        last = self._last_render
-        if last.aside is None:
+    def _lift(self, pose: np.ndarray) -> Lift:
+        """Return what lifts pixels of the render at a pose (4, 4)."""
+        render, last, components = self.render(pose), self._last_render, self.components
+        if last.lift is None:
             with self.clock.stage("render"):
-                aside = pose @ make_pose(np.eye(3), np.array([step, 0.0, 0.0]))
-                last.aside = self.components.renderer.render(self.photo.camera, aside)
-        return last.aside
+                last.lift = lifting(components.renderer, render, self.photo.camera, pose, components.options.lift)
+        return last.lift
 
     @cached_property
     def _last_render(self) -> _LastRender:
         return _LastRender()
 
-    def _solve(self, pose: np.ndarray, render: Render, image: Array, matches: Matches, lifted: Lifted) -> MatchedView:
-        options, camera = self.components.options, self.photo.camera
+    def _solve(self, pose: np.ndarray, render: Render, image: Array, matches: Matches) -> MatchedView:
+        options, camera, lift = self.components.options, self.photo.camera, self._lift(pose)
         with self.clock.stage("solve"):
+            lifted = lift(matches.b)
             lifted_matches = matches.select(lifted.valid)
             found = self.correspondences(matches.a, lifted, pose)
             solution = solve_near(camera, pose, found, options.pose)
             if solution is None or not self.plausible(solution.T_map_camera):
                 solution = solve_pose(camera, found, options.pose, options.seed, self.plausible)
-        lift = partial(self._lifted, pose, render)
         return MatchedView(pose, render, image, len(matches), lifted_matches, found, solution, lift)
 
 

@@ -48,7 +48,7 @@ class CornerTracker:
         Corners that cannot be followed there and back are left out.
         """
         corners = self.corners[worth(self.corners)]
-        return _there_and_back(self._structure, self._see(image).structure, corners)
+        return _matched(self._structure, self._see(image).structure, corners)
 
     def track_back(self, image: Array, worth: Worth = all_of_them) -> Matches:
         """Find the corners of a render (H, W, 3) uint8 RGB that are `worth` it in the photo.
@@ -57,12 +57,12 @@ class CornerTracker:
         """
         render = self._see(image)
         corners = find_corners(render.gray, MAX_RENDER_CORNERS)
-        return _there_and_back(render.structure, self._structure, corners[worth(corners)]).swapped()
+        return _matched(render.structure, self._structure, corners[worth(corners)]).swapped()
 
     def _see(self, image: Array) -> _Seen:
         """Return what a render looks like; that of the last one is kept, as it is tracked both ways."""
         if self._last_render is None or self._last_render.image is not image:
-            gray = cv2.cvtColor(to_host(image), cv2.COLOR_RGB2GRAY)
+            gray = _gray(image)
             self._last_render = _Seen(image, gray, _structure(gray))
         return self._last_render
 
@@ -81,15 +81,38 @@ def seen_off_the_border(photo: Photo) -> np.ndarray:
     return cv2.erode(photo.seen.astype(np.uint8), np.ones((WINDOW, WINDOW), np.uint8))
 
 
-def _there_and_back(here: Pyramid, there: Pyramid, corners: np.ndarray) -> Matches:
-    """Match the corners (N, 2) of one structure with another; those that do not return to where they were left out."""
+class Follower:
+    """Finds where pixels of one picture are in another of nearly the same view."""
+
+    def __init__(self, here: Array, there: Array) -> None:
+        """Take two pictures (H, W, 3) uint8 RGB, on any device."""
+        self._here, self._there = (_structure(_gray(image)) for image in (here, there))
+
+    def follow(self, pixels: np.ndarray) -> np.ndarray:
+        """Return where pixels (N, 2) of the one are in the other, (N, 2); NaN where they cannot be followed."""
+        moved, kept = _there_and_back(self._here, self._there, pixels)
+        return np.where(kept[:, None], moved, np.nan)
+
+
+def _matched(here: Pyramid, there: Pyramid, corners: np.ndarray) -> Matches:
+    """Match the corners (N, 2) of one structure with another."""
     if len(corners) == 0:
         return Matches.none()
-    moved, found = flow(here, there, corners)
+    moved, kept = _there_and_back(here, there, corners)
+    return Matches(corners[kept].astype(np.float64), moved[kept], np.ones(kept.sum()))
+
+
+def _there_and_back(here: Pyramid, there: Pyramid, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return where pixels (N, 2) of one structure are in another, (N, 2), and which return to where they were, (N,)."""
+    moved, found = flow(here, there, pixels)
     back, found_back = flow(there, here, moved)
-    kept = found & found_back & (np.linalg.norm(back - corners, axis=1) <= MAX_RETURN_ERROR)
-    pixels = corners[kept].astype(np.float64)
-    return Matches(pixels, moved[kept].astype(np.float64), np.ones(len(pixels)))
+    returned = np.linalg.norm(back - pixels, axis=1) <= MAX_RETURN_ERROR
+    return moved.astype(np.float64), found & found_back & returned
+
+
+def _gray(image: Array) -> np.ndarray:
+    """Return the brightness (H, W) uint8 of a picture (H, W, 3) uint8 RGB."""
+    return cv2.cvtColor(to_host(image), cv2.COLOR_RGB2GRAY)
 
 
 def _structure(gray: np.ndarray) -> Pyramid:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 
@@ -27,8 +29,8 @@ class LiftOptions:
         max_depth_spread: largest spread of the depths that made the pixel, relative to the median. Of two layers, the
             spread is at most half of the farther one's depth: where it is more than half of the median, the median is
             that of a haze in front of what is seen.
-        max_scatter: largest median of these spreads, over the corners of a photo. Beyond it no depth is trusted, and
-            how far away corners are is seen by parallax (pose/parallax.py).
+        max_scatter: largest median of these spreads, over a render. Beyond it no depth is trusted, and how far away
+            things are is seen by parallax (pose/parallax.py).
     """
 
     min_alpha: float = 0.8
@@ -52,6 +54,10 @@ class Lifted:
     valid: np.ndarray
 
 
+# Finds the points of the map under pixels (M, 2) of a render.
+Lift: TypeAlias = Callable[[np.ndarray], Lifted]
+
+
 def lift(render: Render, camera: Camera, T_map_camera: np.ndarray, pixels: np.ndarray, options: LiftOptions) -> Lifted:
     """Lift pixels (M, 2) of `render`, drawn with `camera` at `T_map_camera` (4, 4), by bilinear median depth.
 
@@ -65,7 +71,7 @@ def lift(render: Render, camera: Camera, T_map_camera: np.ndarray, pixels: np.nd
     pixels = np.ascontiguousarray(pixels, np.float64)
     places, weights = bilinear_neighbours(pixels, width, height)
     limits = options.min_alpha, options.max_depth_step, options.max_depth_spread
-    depth, depth_std = surface_depths(*on_host(render, places), weights, *limits)
+    depth, depth_std = surface_depths(*_on_host(render, places), weights, *limits)
     depth_std = np.minimum(depth_std, MAX_DEPTH_STD * depth)
     return lift_to(camera, T_map_camera, pixels, depth, DEPTH_SIGMA_PER_STD * depth_std)
 
@@ -79,7 +85,7 @@ def lift_to(
     return Lifted(points, (rays * sigmas[:, None]) @ T_map_camera[:3, :3].T, np.isfinite(depths))
 
 
-def on_host(render: Render, places: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def _on_host(render: Render, places: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Median depth, its spread and alpha, flat, and where in them is what is at places (M, ...) of the render."""
     pictures = (render.median_depth, render.depth_std, render.alpha)
     if isinstance(render.alpha, np.ndarray):

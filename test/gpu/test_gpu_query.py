@@ -95,8 +95,8 @@ def test_no_picture_leaves_the_gpu_before_there_is_an_estimate(gpu, renderer, ro
     assert max(gpu.to_host) > SMALL, gpu.explain()
     before = list(takewhile(lambda size: size <= SMALL, gpu.to_host))
     # The photo's corners; the depths that tell how far off a prior may be; of the render at the prior and the first at
-    # an estimate, matches and the depths under them; of the latter whether these can be trusted.
-    assert sum(size > 100 for size in before) == 1 + 1 + 2 * 2 + 1, gpu.explain()
+    # an estimate, whether depths can be trusted, matches and the depths under them.
+    assert sum(size > 100 for size in before) == 1 + 1 + 2 * 3, gpu.explain()
 
 
 def test_a_matcher_on_the_cpu_takes_renders_of_a_gpu(gpu, renderer, room_camera, room_photos) -> None:

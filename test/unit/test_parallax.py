@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from hazes import hazy
@@ -17,7 +18,9 @@ from gsfeatloc_ros.localize.localizer import Localizer
 from gsfeatloc_ros.localize.options import LocalizerOptions
 from gsfeatloc_ros.localize.query import Components
 from gsfeatloc_ros.match import create_matcher, create_tracker
-from gsfeatloc_ros.pose.parallax import lift_as_nearest, lift_by_parallax, step_aside
+from gsfeatloc_ros.match.corners import find_corners
+from gsfeatloc_ros.pose.lift import LiftOptions, lift
+from gsfeatloc_ros.pose.parallax import lift_by_parallax, lifting, step_aside
 from gsfeatloc_ros.render import Render, create_renderer
 
 CAMERA = Camera(64, 48, np.array([[60.0, 0, 31], [0, 61.0, 25], [0, 0, 1]]))
@@ -61,53 +64,57 @@ def test_what_does_not_move_along_its_row_to_the_left_is_not_lifted(moved) -> No
     assert np.isnan(lifted.points).all()
 
 
-def test_others_are_lifted_as_the_nearest_is() -> None:
-    known_pixels = np.array([[10.0, 10.0], [50.0, 10.0], [30.0, 40.0]])
-    depths = np.array([[2.0], [5.0], [9.0]])
-    shifts = CAMERA.K[0, 0] * 0.3 / depths
-    aside = known_pixels - np.hstack([shifts, [[0.0], [0.0], [3.0]]])
-    known = lift_by_parallax(CAMERA, POSE, known_pixels, aside, 0.3)
-    # The third was not found.
-    assert known.valid.tolist() == [True, True, False]
-    pixels = np.array([[12.0, 11.0], [60.0, 3.0], [31.0, 40.0]])
-    lifted = lift_as_nearest(CAMERA, POSE, pixels, known_pixels, known)
-    assert lifted.valid.all()
-    np.testing.assert_allclose(transform(invert(POSE), lifted.points)[:, 2], [2.0, 5.0, 5.0])
-    np.testing.assert_allclose(CAMERA.project(transform(invert(POSE), lifted.points)), pixels)
-
-
-def test_where_nothing_is_there_is_nothing_to_lift() -> None:
-    none = np.empty((0, 2))
-    known = lift_by_parallax(CAMERA, POSE, none, none, 0.3)
-    assert known.points.shape == (0, 3)
-    assert not lift_as_nearest(CAMERA, POSE, np.array([[3.0, 4.0]]), none, known).valid.any()
-    assert lift_as_nearest(CAMERA, POSE, none, none, known).points.shape == (0, 3)
-
-
 def render_of(depth: float, spread: float) -> Render:
     full = np.ones((48, 64), np.float32)
     return Render(np.zeros((48, 64, 3), np.float32), depth * full, depth * full, spread * full, full)
 
 
 def test_it_steps_aside_where_half_of_the_depths_are_scattered() -> None:
+    assert step_aside(render_of(4.0, 0.9), CAMERA, MAX_SCATTER) == 0.0
+    step = step_aside(render_of(4.0, 1.1), CAMERA, MAX_SCATTER)
     pixels = np.array([[0.0, 0.0], [63.0, 47.0], [20.4, 30.6]])
-    assert step_aside(render_of(4.0, 0.9), CAMERA, pixels, MAX_SCATTER) == 0.0
-    step = step_aside(render_of(4.0, 1.1), CAMERA, pixels, MAX_SCATTER)
     points = transform(POSE, CAMERA.rays(pixels) * 4.0)
     np.testing.assert_allclose(seen_aside(points, POSE, step), pixels - [12.0, 0.0], atol=1e-9)
-    one_of_three = render_of(4.0, 0.9)
-    one_of_three.depth_std[0, 0] = 3.0
-    assert step_aside(one_of_three, CAMERA, pixels, MAX_SCATTER) == 0.0
-    assert step_aside(render_of(4.0, 3.0), CAMERA, pixels, float("inf")) == 0.0
+    a_third = render_of(4.0, 0.9)
+    a_third.depth_std[:16] = 3.0
+    assert step_aside(a_third, CAMERA, MAX_SCATTER) == 0.0
+    assert step_aside(render_of(4.0, 3.0), CAMERA, float("inf")) == 0.0
 
 
-def test_without_corners_or_depths_it_stays() -> None:
-    assert step_aside(render_of(4.0, 3.0), CAMERA, np.empty((0, 2)), MAX_SCATTER) == 0.0
-    assert step_aside(render_of(np.nan, np.nan), CAMERA, np.array([[3.0, 4.0]]), MAX_SCATTER) == 0.0
-    one = render_of(np.nan, np.nan)
-    one.median_depth[5, 5], one.depth_std[5, 5] = 2.0, 1.0
-    step = step_aside(one, CAMERA, np.array([[3.0, 4.0], [5.0, 5.0]]), MAX_SCATTER)
-    assert step == pytest.approx(12.0 * 2.0 / CAMERA.K[0, 0])
+def test_without_depths_it_stays() -> None:
+    assert step_aside(render_of(np.nan, np.nan), CAMERA, MAX_SCATTER) == 0.0
+    a_part = render_of(np.nan, np.nan)
+    a_part.median_depth[:16], a_part.depth_std[:16] = 2.0, 1.0
+    assert step_aside(a_part, CAMERA, MAX_SCATTER) == pytest.approx(12.0 * 2.0 / CAMERA.K[0, 0])
+
+
+def test_where_nothing_is_there_is_nothing_to_lift() -> None:
+    none = np.empty((0, 2))
+    assert lift_by_parallax(CAMERA, POSE, none, none, 0.3).points.shape == (0, 3)
+
+
+@pytest.mark.parametrize(("max_scatter", "least", "most"), [(MAX_SCATTER, 0.9, 1.0), (float("inf"), 0.0, 0.1)])
+def test_lifts_what_is_behind_haze_to_where_it_is(room_map, room_camera, room_photos, max_scatter, least, most) -> None:
+    """By the map's depths hardly any corner is."""
+    pinhole, pose = room_camera.pinhole(), room_photos[0].T_map_camera
+    clear, hidden = create_renderer(room_map), create_renderer(hazy(room_map, pinhole, pose))
+    view, hazy_view = (renderer.render(pinhole, pose) for renderer in (clear, hidden))
+    pixels = find_corners(cv2.cvtColor(view.image(), cv2.COLOR_RGB2GRAY), 300).astype(float)
+    truth = lift(view, pinhole, pose, pixels, LiftOptions())
+    lifted = lifting(hidden, hazy_view, pinhole, pose, LiftOptions(max_scatter=max_scatter))(pixels)
+    depths, seen = ((each.points[truth.valid] - pose[:3, 3]) @ pose[:3, 2] for each in (truth, lifted))
+    is_right = np.abs(seen / depths - 1) < 0.1
+    assert least <= is_right.mean() <= most
+
+
+def test_by_the_depths_where_they_can_be_trusted(room_map, room_camera, room_photos) -> None:
+    pinhole, pose = room_camera.pinhole(), room_photos[0].T_map_camera
+    renderer = create_renderer(room_map)
+    render = renderer.render(pinhole, pose)
+    pixels = np.array([[100.0, 80.0], [200.4, 90.6]])
+    by_depth = lift(render, pinhole, pose, pixels, LiftOptions())
+    lifted = lifting(renderer, render, pinhole, pose, LiftOptions())(pixels)
+    np.testing.assert_array_equal(lifted.points, by_depth.points)
 
 
 @pytest.mark.parametrize("number", range(4))

@@ -16,7 +16,7 @@ from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.geometry import invert, make_pose, so3_exp, transform
 from gsfeatloc_ros.common.local_structure import local_structure
 from gsfeatloc_ros.common.photo import Photo
-from gsfeatloc_ros.match.track import CornerTracker
+from gsfeatloc_ros.match.track import CornerTracker, Follower
 from gsfeatloc_ros.match.track_gpu import GpuCornerTracker
 from gsfeatloc_ros.render import create_renderer
 
@@ -141,3 +141,22 @@ def test_only_what_is_worth_it_is_looked_for() -> None:
     assert (matches.a[:, 0] < 80).all()
     assert (tracker.track_back(image, lambda pixels: pixels[:, 1] < 60).b[:, 1] < 60).all()
     assert len(tracker.track(image, lambda pixels: np.zeros(len(pixels), bool))) == 0
+
+
+@settings(deadline=None, max_examples=20)
+@given(seed=st.integers(0, 1000), dx=st.floats(-6, 6), dy=st.floats(-6, 6))
+def test_pixels_of_a_moved_picture_are_followed_each_in_its_place(seed: int, dx: float, dy: float) -> None:
+    image = smooth_noise(seed)
+    moved = cv2.warpAffine(image, np.array([[1, 0, dx], [0, 1, dy]]), (160, 120), flags=cv2.INTER_CUBIC)
+    pixels = np.random.default_rng(seed).uniform([30, 30], [130, 90], (50, 2))
+    followed = Follower(image, moved).follow(pixels)
+    assert followed.shape == (50, 2)
+    found = np.isfinite(followed).all(axis=1)
+    assert found.mean() > 0.8
+    assert np.median(np.linalg.norm(followed - pixels - [dx, dy], axis=1)[found]) < 0.1
+
+
+def test_what_cannot_be_followed_is_said_to_be_nowhere() -> None:
+    image, pixels = smooth_noise(1), np.array([[40.0, 40.0], [80.0, 60.0]])
+    assert np.isnan(Follower(image, np.full_like(image, 128)).follow(pixels)).all()
+    assert Follower(image, image).follow(np.empty((0, 2))).shape == (0, 2)
