@@ -16,9 +16,9 @@ _COVERAGE_CELLS = (8, 6)
 
 # A right calibration reads as a longer or shorter focal length by at most this share, and the first number of the
 # reading's own standard deviations beside: of 430 right photos one is beyond. A wrong one that is off by no more than
-# the second of these beside may read as right.
+# the second of these beside may read as right. One that is known to be right is contradicted by the third alone.
 _MAX_FOCAL_ERROR = 0.01
-_FOCAL_SIGMAS, _UNSEEN_FOCAL_SIGMAS = 1.0, 1.5
+_FOCAL_SIGMAS, _UNSEEN_FOCAL_SIGMAS, _KNOWN_FOCAL_SIGMAS = 1.0, 1.5, 3.0
 # Wrong poses that match well are those of mirror images. Where the photo's mirror image suggests nothing, or what is a
 # hundred times more likely to be wrong, a pose is a hundred times less likely to be wrong than it was: of the mirrored
 # photos that match well the index finds more than that.
@@ -175,6 +175,11 @@ class Limits:
         live=True,
     )
 
+    @property
+    def focal_length_is_known(self) -> bool:
+        """Whether the calibrated focal length is known to be right."""
+        return self.max_focal_error >= 1
+
 
 def verdict(evidence: Evidence, limits: Limits) -> tuple[str, ...]:
     """Return the reasons against an estimate, the weightiest first; none: it is an answer."""
@@ -186,7 +191,7 @@ def verdict(evidence: Evidence, limits: Limits) -> tuple[str, ...]:
             f"it looks the way that the prior does, turned by {abs(evidence.roll_deg):.0f} degrees about the camera's "
             "axis: is the camera mounted so, or does the image show a picture of the place?"
         )
-    if focal_length_is_wrong(evidence):
+    if focal_length_is_wrong(evidence, limits):
         error, sigma = 100 * evidence.focal_error, 100 * evidence.focal_sigma
         reasons.append(
             f"the focal length fits {abs(error):.1f} +- {sigma:.1f} % {'longer' if error > 0 else 'shorter'} than "
@@ -286,14 +291,17 @@ def with_mirror(evidence: Evidence, mirror_probability_wrong: float) -> Evidence
     return replace(evidence, probability_wrong=wrong, mirror_probability_wrong=mirror_probability_wrong)
 
 
-def focal_length_is_wrong(evidence: Evidence) -> bool:
+def focal_length_is_wrong(evidence: Evidence, limits: Limits) -> bool:
     """Return whether the photo contradicts the focal length that was calibrated."""
-    return abs(evidence.focal_error) > _MAX_FOCAL_ERROR + _FOCAL_SIGMAS * evidence.focal_sigma
+    most = _MAX_FOCAL_ERROR + _FOCAL_SIGMAS * evidence.focal_sigma
+    if limits.focal_length_is_known:
+        most = max(most, _KNOWN_FOCAL_SIGMAS * evidence.focal_sigma)
+    return abs(evidence.focal_error) > most
 
 
 def camera_is_in_doubt(evidence: Evidence, limits: Limits) -> bool:
     """Return whether the photo contradicts the calibrated focal length, or could not contradict one that matters."""
-    return focal_length_is_wrong(evidence) or unseen_focal_error(evidence) > limits.max_focal_error
+    return focal_length_is_wrong(evidence, limits) or unseen_focal_error(evidence) > limits.max_focal_error
 
 
 def unseen_focal_error(evidence: Evidence) -> float:

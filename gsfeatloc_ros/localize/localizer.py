@@ -213,8 +213,7 @@ class Localizer:
     def _with_the_focal_length_asked(self, query: Query, search: Search, found: _Candidate) -> _Candidate:
         """Return a candidate, refused if with another focal length many more corners agree."""
         options, small = self._components.options, search.small
-        is_known = options.limits.max_focal_error >= 1
-        if is_known or not (found.pose and found.is_believed_by_a_part):
+        if options.limits.focal_length_is_known or not (found.pose and found.is_believed_by_a_part):
             return found
         matched, small_options = small.match(found.pose[0], same_way_up=True).found, _for_small(query, small)
         with query.clock.stage("verify"):

@@ -183,6 +183,19 @@ def test_a_photo_that_would_not_show_a_wrong_focal_length_is_no_answer() -> None
     assert "the focal length fits 10.0 +- 3.0 % shorter" in reason
 
 
+@pytest.mark.parametrize(
+    ("sigma", "most", "most_where_known"), [(0.003, 0.013, 0.013), (0.005, 0.015, 0.015), (0.02, 0.03, 0.06)]
+)
+def test_a_focal_length_that_is_known_is_not_doubted_for_what_three_deviations_explain(
+    sigma: float, most: float, most_where_known: float
+) -> None:
+    for limits, largest in ((Limits(), most), (Limits(max_focal_error=1.0), most_where_known)):
+        for error in (largest, -largest):
+            assert verdict(replace(GOOD, focal_error=0.99 * error, focal_sigma=sigma), limits) == ()
+            (reason,) = verdict(replace(GOOD, focal_error=1.01 * error, focal_sigma=sigma), limits)
+            assert "the focal length fits" in reason
+
+
 def test_a_camera_that_cannot_be_fitted_is_none() -> None:
     assert verdict(replace(GOOD, focal_error=float("nan"), focal_sigma=float("nan")), Limits()) == ()
 
