@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gsfeatloc_ros.common.camera import Camera
-from gsfeatloc_ros.common.geometry import moved
+from gsfeatloc_ros.common.geometry import invert, make_pose, moved, transform
 from gsfeatloc_ros.pose.linear import CAMERA_PARAMETERS, POSE_PARAMETERS, linearize, normal_equations
 from gsfeatloc_ros.pose.residual_field import ResidualField
 from gsfeatloc_ros.pose.solve import Correspondences, PoseOptions, whiten
@@ -24,6 +24,10 @@ _FOCAL = 0
 # What a photo says of the camera is judged as if its matches were spread over a whole one: that is what the limits on
 # the focal length (localize/evidence.py) were set by.
 _WHOLE_PHOTO = 18.0
+# A few matches with wrong depths may hold a wrong focal length where it is. So steps are taken from ones that are off
+# by these shares as well; where they lead to is followed if it is more likely, its logarithm by more than this.
+_OTHER_FOCALS = (-0.05, 0.05)
+_CLEARLY_LIKELIER = 1.0
 # Steps are taken until what they change, in standard deviations, is less than a thousandth.
 _MAX_ITERATIONS = 6
 _MIN_STEP = 1e-3
@@ -96,7 +100,7 @@ def fit_camera(
 
 def _fit(camera: Camera, calibrated: _State, found: Correspondences, options: PoseOptions) -> CameraFit:
     problem = _Problem.seen_from(calibrated, camera, found, options)
-    free = problem.solve(problem.at(calibrated), _ANY_CAMERA)
+    free = problem.most_likely(calibrated)
     # The keypoints' noise is what is left once the camera's errors are explained.
     problem = _Problem.seen_from(free, camera, found, options)
     system = problem.at(free)
@@ -187,6 +191,36 @@ class _Problem:
         if whitening is None:
             raise _BehindCameraError
         return cls(camera, found, whitening, options)
+
+    def most_likely(self, calibrated: _State) -> _State:
+        """Return the most likely state of any camera, by steps from the calibrated one and from other focal lengths."""
+        best = self.solve(self.at(calibrated), _ANY_CAMERA)
+        least = self.loss(best)
+        for error in _OTHER_FOCALS:
+            start = self._zoomed(calibrated, error)
+            try:
+                state = self.solve(self.at(start), _ANY_CAMERA)
+                loss = self.loss(state)
+            except (np.linalg.LinAlgError, _BehindCameraError):
+                continue
+            if loss < least - _CLEARLY_LIKELIER:
+                best, least = state, loss
+        return best
+
+    def _zoomed(self, calibrated: _State, error: float) -> _State:
+        """Return the state with a focal length longer by this share: farther back, what it sees is as large as before.
+
+        So it is at the median depth.
+        """
+        depth = np.median(transform(invert(calibrated.pose), self.found.points)[:, 2])
+        back = make_pose(np.eye(3), np.array([0.0, 0.0, -error * depth]))
+        return _State(calibrated.pose @ back, np.where(np.arange(CAMERA_PARAMETERS) == _FOCAL, error, 0.0))
+
+    def loss(self, state: _State) -> float:
+        """Return minus the logarithm of how likely a state of any camera is, but for a constant."""
+        scale = self.options.cauchy_scale
+        by_photo = scale**2 * np.log1p(self.at(state).squared / scale**2).sum()
+        return float(0.5 * (by_photo + ((state.camera / _ANY_CAMERA) ** 2).sum()))
 
     def solve(self, system: _System, deviations: np.ndarray) -> _State:
         """Return the most likely state, from the problem at one near it."""

@@ -115,6 +115,18 @@ def test_the_focal_length_is_told_as_surely_as_it_reads(error: float, k1: float,
     assert np.mean(squares) < 1.2
 
 
+@pytest.mark.parametrize("error", [-0.1, 0.1])
+@pytest.mark.parametrize("seed", range(5))
+def test_a_few_wrong_depths_do_not_hold_a_wrong_focal_length(error: float, seed: int) -> None:
+    """Corners of a wall beside what is near, which were lifted onto that, agree with the pose of the calibration."""
+    found = seen(longer(error), depths=(4, 4.3), seed=seed).select(np.arange(180))
+    T = fitted(found)[1].T_map_camera
+    found.points[:4] = transform(T, CAMERA.rays(found.pixels[:4]) * 1.8)
+    fit = fit_camera(CAMERA, T, found, PoseOptions())
+    assert abs(fit.focal - error) < 3 * fit.focal_sigma < 0.1
+    assert abs(fit.focal) > 0.5 * abs(error)
+
+
 def nees(found: Correspondences) -> float:
     """The normalised squared error of the fit, per degree of freedom."""
     fit, _ = fitted(found)
