@@ -24,6 +24,10 @@ _FOCAL = 0
 # What a photo says of the camera is judged as if its matches were spread over a whole one: that is what the limits on
 # the focal length (localize/evidence.py) were set by.
 _WHOLE_PHOTO = 18.0
+# Of a wall from the front nothing tells a focal length but a match that was lifted onto something else. What alone
+# tells more than this share of what is known of it is left out, then what of the rest does, and so on, so many times.
+_MAX_SHARE_OF_A_MATCH = 0.2
+_MAX_LEFT_OUT = 3
 # A few matches with wrong depths may hold a wrong focal length where it is. So steps are taken from ones that are off
 # by these shares as well; where they lead to is followed if it is more likely, its logarithm by more than this.
 _OTHER_FOCALS = (-0.05, 0.05)
@@ -111,8 +115,9 @@ def _fit(camera: Camera, calibrated: _State, found: Correspondences, options: Po
     # What the photo does not contradict is as calibrated: it says more of the focal length then.
     likely = np.clip(excess, _CALIBRATED, _ANY_CAMERA)
     likely[_FOCAL] = _ANY_CAMERA[_FOCAL]
-    focal = free.camera[_FOCAL] + system.step(likely)[POSE_PARAMETERS + _FOCAL]
-    focal_sigma = problem.camera_sigmas(system, unbent, likely)[_FOCAL]
+    told, telling = problem.told_by_many(calibrated, system, likely)
+    focal = telling.state.camera[_FOCAL] + telling.step(likely)[POSE_PARAMETERS + _FOCAL]
+    focal_sigma = told.camera_sigmas(telling, unbent, likely)[_FOCAL]
     followed = np.clip(excess, _EXACT, _ANY_CAMERA)
     followed[_FOCAL] = _EXACT[_FOCAL]
     kept = problem.solve(system, followed)
@@ -215,6 +220,31 @@ class _Problem:
         depth = np.median(transform(invert(calibrated.pose), self.found.points)[:, 2])
         back = make_pose(np.eye(3), np.array([0.0, 0.0, -error * depth]))
         return _State(calibrated.pose @ back, np.where(np.arange(CAMERA_PARAMETERS) == _FOCAL, error, 0.0))
+
+    def told_by_many(self, calibrated: _State, system: _System, deviations: np.ndarray) -> tuple[_Problem, _System]:
+        """Return the problem without matches that alone tell much of the focal length, and its most likely system.
+
+        That of this problem is `system`.
+        """
+        problem = self
+        for _ in range(_MAX_LEFT_OUT):
+            tells_alone = problem.focal_shares(system, deviations) > _MAX_SHARE_OF_A_MATCH
+            if not tells_alone.any():
+                break
+            kept = np.flatnonzero(~tells_alone)
+            problem = replace(problem, found=problem.found.select(kept), whitening=problem.whitening[kept])
+            system = problem.at(problem.most_likely(calibrated))
+        return problem, system
+
+    def focal_shares(self, system: _System, deviations: np.ndarray) -> np.ndarray:
+        """Return the share (M,) of each match in what all tell of the focal length, beside the other parameters."""
+        weighted = np.sqrt(system.weights)[:, None, None] * (self.whitening @ system.jacobian)
+        rows, focal = weighted.reshape(-1, weighted.shape[2]), POSE_PARAMETERS + _FOCAL
+        others = np.delete(rows, focal, axis=1)
+        information = others.T @ others + np.diag(np.delete(_information(deviations), focal))
+        alone = rows[:, focal] - others @ np.linalg.solve(information, others.T @ rows[:, focal])
+        told = (alone.reshape(-1, 2) ** 2).sum(axis=1)
+        return told / max(told.sum(), np.finfo(float).tiny)
 
     def loss(self, state: _State) -> float:
         """Return minus the logarithm of how likely a state of any camera is, but for a constant."""

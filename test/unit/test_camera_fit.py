@@ -127,6 +127,17 @@ def test_a_few_wrong_depths_do_not_hold_a_wrong_focal_length(error: float, seed:
     assert abs(fit.focal) > 0.5 * abs(error)
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_no_match_tells_the_focal_length_alone(seed: int) -> None:
+    """Of a wall from the front, one corner that was lifted onto something near would say that all is well."""
+    found = seen(longer(0.08), depths=(4, 4.1), seed=seed).select(np.arange(100))
+    T = fitted(found)[1].T_map_camera
+    found.points[0] = transform(T, CAMERA.rays(found.pixels[:1]) * 2.5)
+    fit, without = (fit_camera(CAMERA, T, each, PoseOptions()) for each in (found, found.select(np.arange(1, 100))))
+    assert fit.focal_sigma > 0.8 * without.focal_sigma
+    assert abs(fit.focal - 0.08) < 3 * fit.focal_sigma
+
+
 def nees(found: Correspondences) -> float:
     """The normalised squared error of the fit, per degree of freedom."""
     fit, _ = fitted(found)
