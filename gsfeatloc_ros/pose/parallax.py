@@ -13,7 +13,6 @@ import numpy as np
 from gsfeatloc_ros.common.arrays import to_host
 from gsfeatloc_ros.common.camera import Camera
 from gsfeatloc_ros.common.geometry import make_pose
-from gsfeatloc_ros.match.track import Follower
 from gsfeatloc_ros.pose.lift import Lift, Lifted, LiftOptions, lift, lift_to
 from gsfeatloc_ros.render.base import Render, Renderer
 
@@ -37,6 +36,9 @@ def lifting(renderer: Renderer, render: Render, camera: Camera, T_map_camera: np
     if step == 0:
         return partial(lift, render, camera, T_map_camera, options=options)
     aside = renderer.render(camera, T_map_camera @ make_pose(np.eye(3), np.array([step, 0.0, 0.0])))
+    # Not before the first: numba takes a second to load, and makes a folder.
+    from gsfeatloc_ros.match.track import Follower
+
     follower = Follower(render.device_image(), aside.device_image())
     return lambda pixels: lift_by_parallax(camera, T_map_camera, pixels, follower.follow(pixels), step)
 

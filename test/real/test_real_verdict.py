@@ -36,9 +36,10 @@ def test_a_wheel_that_agrees_does_not_hide_the_rest(scenes) -> None:
 @pytest.mark.parametrize(
     ("scene_name", "photo_name", "corruption", "seed", "says"),
     [
-        ("office", "00175.jpg", "focal+10", 305, "the focal length fits 8.0 +- 2.0 % shorter than calibrated"),
-        ("office", "00175.jpg", "focal+10", 314, "the focal length fits 8.0 +- 2.0 % shorter than calibrated"),
-        # Once the same; by other matches of the search, or depths by parallax, the reading itself says so.
+        # The reading itself says so: 9.1 % shorter is what the camera is.
+        ("office", "00175.jpg", "focal+10", 305, "the focal length fits 9.1 +- 0.7 % shorter than calibrated"),
+        ("office", "00175.jpg", "focal+10", 314, "the focal length fits 9.4 +- 1.2 % shorter than calibrated"),
+        ("office", "00183.jpg", "focal+10", 205, "the focal length fits 5.6 +- 2.4 % shorter than calibrated"),
         ("bonsai", "DSCF5813.jpg", "focal-10", 103, "% longer than calibrated: is camera_info of this stream?"),
         ("office", "00175.jpg", "focal+10", 102, "% shorter than calibrated: is camera_info of this stream?"),
         ("office", "00175.jpg", "focal+10", 200, "% shorter than calibrated: is camera_info of this stream?"),
@@ -87,14 +88,21 @@ def test_a_blurred_mirror_image_is_no_photo(scenes, corruption: str, mirrored: b
         assert "it is wrong with a probability of" in estimate.reason
 
 
-@pytest.mark.parametrize("photo_name", ["00175.jpg", "00183.jpg", "00273.jpg"])
-def test_a_haze_near_a_wall_lends_it_no_relief(scenes, photo_name: str) -> None:
-    """Of a wall from the front, whose corners were lifted onto a haze a tenth nearer: up to 7 degrees off."""
+@pytest.mark.parametrize(("photo_name", "is_flat"), [("00175.jpg", False), ("00183.jpg", True), ("00273.jpg", False)])
+def test_a_haze_near_a_wall_lends_it_no_relief(scenes, photo_name: str, is_flat: bool) -> None:
+    """Of a wall from the front, whose corners were lifted onto a haze a tenth nearer: up to 7 degrees off.
+
+    One is so flat that without haze it would not show a wrong focal length; nor does it with haze.
+    """
     scene = load_scene(scenes / "office")
     number, photo = next((n, p) for n, p in enumerate(scene.photos) if p.name == photo_name)
     renderer = load_degraded_renderer(scene, RendererSettings(), lambda map_: degrade("haze", map_, scene, 203))
     prior = next(prior for prior in PROTOCOLS["paper"](scene, 1.0, 203) if prior.photo == number)
     localizer = Localizer(renderer, create_matcher("sift"), LocalizerOptions(seed=203))
     estimate = localizer.localize(scene.read_photo(photo), photo.camera, prior.T_map_camera, prior.covariance)
+    if is_flat:
+        assert not estimate.localized
+        assert "would not show in this image" in estimate.reason
+        return
     assert estimate.localized, estimate.reason
     assert rotation_error_deg(estimate.T_map_camera, photo.T_map_camera) < 0.5
