@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gsfeatloc_ros.common.camera import Camera
-from gsfeatloc_ros.common.geometry import invert, make_pose, moved, transform
+from gsfeatloc_ros.common.geometry import moved
 from gsfeatloc_ros.pose.linear import CAMERA_PARAMETERS, POSE_PARAMETERS, linearize, normal_equations
 from gsfeatloc_ros.pose.residual_field import ResidualField
 from gsfeatloc_ros.pose.solve import Correspondences, PoseOptions, whiten
@@ -217,9 +217,11 @@ class _Problem:
 
         So it is at the median depth.
         """
-        depth = np.median(transform(invert(calibrated.pose), self.found.points)[:, 2])
-        back = make_pose(np.eye(3), np.array([0.0, 0.0, -error * depth]))
-        return _State(calibrated.pose @ back, np.where(np.arange(CAMERA_PARAMETERS) == _FOCAL, error, 0.0))
+        depth = np.median(_depths(self.calibrated, calibrated.pose, calibrated.camera, self.found))
+        step = np.zeros(POSE_PARAMETERS + CAMERA_PARAMETERS)
+        step[:3] = -error * depth * calibrated.pose[:3, 2]
+        step[POSE_PARAMETERS + _FOCAL] = error
+        return calibrated.moved(step)
 
     def told_by_many(self, calibrated: _State, system: _System, deviations: np.ndarray) -> tuple[_Problem, _System]:
         """Return the problem without matches that alone tell much of the focal length, and its most likely system.
